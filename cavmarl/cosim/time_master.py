@@ -344,7 +344,7 @@ class TimeMaster:
     def check_follower(self, follower: TimeFollower) -> None:
         """Check that a follower still follows.
 
-        Raises ClockError: it has left, or the master was released.
+        Raises ClockError: the follower has left, or the master was released.
         """
         if follower not in self._followers:
             raise ClockError(f"'{follower.name}' no longer follows; join again (TimeMaster.follow)")

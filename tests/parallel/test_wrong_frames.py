@@ -174,7 +174,7 @@ def drop(frame: Sent) -> Sent:
         (FrameKind.MESSAGES, add_number(1), "a frame of kind MESSAGES is of generation 1, not 0"),
         (FrameKind.SHARE, as_kind(FrameKind.REFUSED), "must not send frames of kind REFUSED"),
         (FrameKind.SHARE, as_kind(FrameKind.GIVE), "a frame of kind GIVE is of generation"),
-        (FrameKind.SHARE, as_kind(FrameKind.SYNC), "it claims an order to recover"),
+        (FrameKind.SHARE, as_kind(FrameKind.SYNC), "it claims that a recovery was ordered"),
     ],
 )  # fmt: skip
 def test_the_sender_of_a_wrong_frame_number_or_kind_is_lost(

@@ -160,8 +160,8 @@ class CarlaReplay:
             )
         if recording.most_rows > capacity:
             raise RecordingError(
-                f"{recording.name}: has {recording.most_rows} vehicles at a time, and this world "
-                f"room for {capacity}; start the server with more vehicles (--set "
+                f"{recording.name}: has {recording.most_rows} vehicles at a time, but this world "
+                f"has room for {capacity}; start the server with more vehicles (--set "
                 "population.external=N)"
             )
         self._type_of = _types_of(recording, types)

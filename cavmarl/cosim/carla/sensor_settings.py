@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 class SensorSettings:
     """The attributes of a sensor as numbers. Raises CallRefused for other values.
 
-    `order`: number of sensors that the episode had before; it separates their random numbers.
+    `order`: number of earlier sensors in the episode, which selects the random numbers.
     """
 
     def __init__(self, actor: CarlaActor, order: int) -> None:

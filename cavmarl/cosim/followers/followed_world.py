@@ -343,7 +343,7 @@ class FollowedWorld:
     def _await_leader(self) -> None:
         """Wait for the tick of the follower that leads.
 
-        Raises FollowerError: it does not tick in time, or its messages are invalid.
+        Raises FollowerError: the follower does not tick in time, or sends invalid messages.
         """
         if (leader := self.leader) is not None:
             self._settle(self._barrier.await_tick(leader, self._moment))
@@ -351,7 +351,7 @@ class FollowedWorld:
     def _confirm_tick(self) -> None:
         """Tell the follower that leads that its step has been made.
 
-        Raises FollowerLostError: it has ended.
+        Raises FollowerLostError: the follower has ended.
         """
         if (leader := self.leader) is not None:
             try:

@@ -168,7 +168,7 @@ class Barrier:
     def confirm_tick(self, seat: FollowerSeat) -> None:
         """Tell the follower that leads that its step has been made.
 
-        Raises FollowerLostError: it does not read, or has ended.
+        Raises FollowerLostError: the follower does not read, or has ended.
         """
         seat.has_ticked = False
         tick = int(seat.clock.master.world_ticks[0])
@@ -321,7 +321,7 @@ class Barrier:
 def _action(vehicle: str, controls: Mapping[str, Any]) -> Any:
     """Return one vehicle's action.
 
-    Raises FollowerError: it is missing.
+    Raises FollowerError: the action is missing.
     """
     if vehicle not in controls:
         raise FollowerError(f"no controls of {vehicle}, which is in the frame")

@@ -173,7 +173,7 @@ class JoiningNodes:
                 "versions on all machines, since results would differ"
             )
         elif self._room() <= sum(each.is_accepted for each in self._all.values()):
-            why = "no more nodes are needed: all zones have a node, and a spare one waits"
+            why = "no more nodes are needed: all zones have a node, and a spare node waits"
         else:
             node.is_accepted = True
             self._links.send(number, FrameKind.JOB, 0, [self._job])

@@ -359,7 +359,7 @@ def _read(data: memoryview, at: int, kind: DTypeLike, num: int) -> tuple[Array, 
     dtype = np.dtype(kind)
     if not 0 <= num <= (len(data) - at) // dtype.itemsize:
         raise MessageError(
-            f"{len(data)} bytes have no {num} items of {dtype.itemsize} bytes at {at}"
+            f"{len(data)} bytes are too short for {num} items of {dtype.itemsize} bytes at {at}"
         )
     return np.frombuffer(data, dtype, num, at) if num else np.zeros(0, dtype), at + (
         num * dtype.itemsize

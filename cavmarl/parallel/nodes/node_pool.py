@@ -550,7 +550,7 @@ class NodePool:
             name = name_of(state.zones[hosts[0]])
             cure = (
                 "The log says why each node was lost; make the environment again, with a larger "
-                f"workers.max_retries than {self._max_retries} if more losses are to be expected"
+                f"workers.max_retries than {self._max_retries} if you expect more losses"
             )
             raise WorkerDeathError(hosts[0], name, state.number, "step", causes, cure)
         if not self._nodes:

@@ -150,7 +150,7 @@ class NodeWatch:
         witnesses = (number for pong in self._answered.values() for number in pong.witnesses)
         for number in witnesses:  # an order would have arrived before the PING
             if number in living:
-                raise SilentNodeError(number, MessageError("it claims an order to recover"))
+                raise SilentNodeError(number, MessageError("it claims that a recovery was ordered"))
         for pong in self._answered.values():
             for number in {self._holder(agent) for agent in pong.agents} & {*living}:
                 raise SilentNodeError(number, MessageError("it has not refused foreign actions"))

@@ -430,7 +430,7 @@ def _read_totals(number: int, data: memoryview) -> tuple[int, list[Any]]:
     """Read the report of a node about itself; see `node_loads.totals`."""
     report = read_json(data, list)
     if len(report) != 1 + TOTALS or report[0] != number:
-        raise MessageError(f"it reports the load {report!r}")
+        raise MessageError(f"it reports the invalid load {report!r}")
     return number, list(map(float, report[1:5])) + list(map(int, report[5:]))
 
 
@@ -448,7 +448,7 @@ def _read_links(number: int, data: memoryview) -> tuple[int, list[dict[str, Any]
     links = []
     for row in rows:
         if not isinstance(row, list) or len(row) != 1 + len(LinkQuality._fields):
-            raise MessageError(f"it reports the connection {row!r}")
+            raise MessageError(f"it reports the invalid connection {row!r}")
         to, is_encrypted, *values = row
         numbers = [None if value is None else float(value) for value in values]
         quality = LinkQuality(bool(is_encrypted), *numbers)._asdict()

@@ -69,7 +69,7 @@ def _read(file: BytesIO, end: int) -> Array:
     Raises one of `_UNREADABLE`.
     """
     if np.lib.format.read_magic(file) != (1, 0):
-        raise ValueError("an array has another header")
+        raise ValueError("an array has an unsupported header")
     size = file.read(2)
     shape, is_fortran, dtype = _parsed(size + file.read(int.from_bytes(size, "little")))
     count = prod(shape)
