@@ -84,7 +84,7 @@ class RosBridge:
     """A follower of a world as a ROS 2 node.
 
     Args:
-        follower: the connection to the world; its `truth` must equal `options.truth`.
+        follower: the connection to the world, with the same `truth` as `options`.
         options: settings of the bridge.
 
     Attributes:

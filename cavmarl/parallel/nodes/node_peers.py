@@ -196,7 +196,7 @@ class NodePeers(Peers):
                 _check_end(data, self._add_passing(departures, data, 0))
 
     def _passing(self, departures: DepartureQueue) -> list[Bytes]:
-        """Return the number of vehicles in `departures.passing` of each world, and their rows."""
+        """Return the number of leaving vehicles of each world, and their rows."""
         counts = departures.num_passing.copy()
         rows = [departures.passing[w, :num] for w, num in enumerate(counts.tolist()) if num]
         return [counts.data, *map(_bytes, rows)]

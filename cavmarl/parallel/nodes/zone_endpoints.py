@@ -292,7 +292,7 @@ class ZoneEndpoints(OwnershipRuntime):
         """Offer vehicles that have crossed a border to the zones that contain them.
 
         Returns:
-            `Report.movers`, and whether vehicles without a record have also crossed a border.
+            `movers` of the report, and whether vehicles without a record have crossed a border.
         """
         division, endpoints = self._division, self._endpoints[w]
         check_all, self._stirred[w] = self._stirred[w] or began, False
