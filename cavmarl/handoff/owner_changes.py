@@ -99,7 +99,7 @@ class OwnerChanges:
 
     @staticmethod
     def unseen(vehicle: int, zone: int) -> ConfigError:
-        """Return the error for a vehicle that enters a zone without a ghost of it."""
+        """Return the error for a vehicle that enters a zone without a ghost of the vehicle."""
         return ConfigError(
             f"vehicle {vehicle} entered zone {zone}, which has no ghost of it: the halo is too "
             "narrow; increase zones.halo_m"

@@ -124,7 +124,7 @@ class ActorTable:
     """The actors of one episode, and their states as records of a snapshot.
 
     `first_number`: number of the first actor, larger than all numbers of earlier episodes, because
-    clients remember actors by their numbers. `next_number`: least number of the first vehicle.
+    clients remember actors by their numbers. `next_number`: smallest number of the first vehicle.
     `known`: actors of vehicles that may appear, by the ids of the vehicles.
     """
 

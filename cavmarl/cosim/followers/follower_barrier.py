@@ -44,12 +44,12 @@ class FollowerSeat:
     waits: bool = True  # whether the world waits for its answers
     leads: bool = False  # whether its ticks release the steps of the world
     has_ticked: bool = False  # whether it has released the next step
-    frame: int = -1  # frame of the last snapshot sent to it; -1: none yet
+    frame: int = -1  # frame of the last snapshot sent to the follower; -1: none yet
     held: dict[str, Any] = field(default_factory=dict)  # last controls of its vehicles
     answers: int = 0  # number of controls sent in time
     late: int = 0  # number of answers to earlier snapshots, which are discarded
     bad: int = 0  # number of invalid controls of a vehicle
-    wait_wall_s: float = 0.0  # time that the world has waited for it, by the wall clock
+    wait_wall_s: float = 0.0  # time that the world has waited for the follower, wall clock
     slowest: int = 0  # number of steps in which it was the last to answer
     unseen: int = 0  # number of snapshots not sent, because earlier snapshots were unread
 
@@ -210,7 +210,7 @@ class Barrier:
     ) -> bool:
         """Receive one frame of a follower; return whether the follower is done.
 
-        Raises FollowerError: the world cannot continue with it.
+        Raises FollowerError: the world cannot continue with this follower.
         """
         # A frame that arrived just before the deadline is still read.
         within_s = max(within_s, 1e-3)

@@ -138,7 +138,7 @@ class VehicleTopics:
     Attributes:
         base: name of the frame `base_link`.
         kinds: type of each topic.
-        latched: topics whose last message is for late subscribers, too.
+        latched: topics whose last message late subscribers also get.
         motion: its motion as far as it is known without the true state.
 
     Raises:
@@ -326,7 +326,7 @@ class WorldTopics:
 
     Attributes:
         kinds: type of each topic.
-        latched: topics whose last message is for late subscribers, too.
+        latched: topics whose last message late subscribers also get.
     """
 
     def __init__(self, vehicles: Sequence[VehicleTopics], clock: RosClock, truth: bool) -> None:

@@ -238,7 +238,7 @@ class _Fit(NamedTuple):
     motion: Points  # (4, 4) from the vehicle's frame to the map's
     placed: Points  # (n, 3) echoes on the map
     rows: NDArray[np.int64]  # nearest wall point of each echo
-    distance_m: Points  # (n,) distance to it
+    distance_m: Points  # (n,) distance to the nearest wall point
 
     def shifted(self, target: Target, by_m: Points) -> _Fit:
         """Return the scan shifted by (2,) in the plane."""

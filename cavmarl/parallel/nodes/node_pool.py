@@ -82,7 +82,7 @@ class NodePool:
 
     owner: NDArray[np.int32]
     _performed: NodeCommand | None = None  # the current command
-    _exchanged = 0  # number of answers of a network simulator that nodes have received for it
+    _exchanged = 0  # number of answers of a network simulator sent for this command
 
     def __init__(
         self,
@@ -266,7 +266,7 @@ class NodePool:
 
         Args:
             command: for all nodes.
-            read: reads the result of a node; an error in it is the fault of the node.
+            read: reads the result of a node; the node is at fault if `read` fails.
 
         Returns:
             what `read` returns for each node, the reporter first.

@@ -195,7 +195,7 @@ class StateReplicas:
         return donor in self._given and self._given[donor].number == generation
 
     def _read(self, data: Bytes, like: Sequence[Array]) -> list[Array]:
-        """Read a kept state. Raises ConfigError: the worlds cannot resume from it."""
+        """Read a kept state. Raises ConfigError: the worlds cannot resume from the state."""
         saved = from_bytes(data, like)
         self._worlds.check(saved, is_whole=False)
         return saved
@@ -223,7 +223,7 @@ class StateReplicas:
             if not len(other[n]):
                 continue
             if len(saved[n]):
-                raise MessageError(f"its state has vehicles of zone {(n - first) % zones}, too")
+                raise MessageError(f"its state also has vehicles of zone {(n - first) % zones}")
             saved[n] = other[n]
             w = (n - first) // zones
             agents = other[n]["agent"][other[n]["agent"] >= 0]

@@ -46,7 +46,7 @@ class CommandedWorlds(ABC):
         world: see `SteppedWorlds`.
         in_next_step: see `SteppedWorlds`.
         arrays: see `SteppedWorlds`.
-        placement: which worker or node hosts what.
+        placement: which worker or node hosts which shards.
         mover: changes the placement between steps; None: it does not change.
         pool: the processes.
     """

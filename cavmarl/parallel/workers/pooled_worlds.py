@@ -116,7 +116,7 @@ class PooledWorlds(CommandedWorlds):
         self.placement.watch(self._pids())
 
     def _make_mover(self, num_worlds: int, workers: int) -> MovingMemory | None:
-        """Make the mover, and return the memory that workers share for it; None: nothing moves."""
+        """Make the mover, and return the memory that its workers share; None: nothing moves."""
         every = self.world.config.workers.balance_steps
         if not every or workers == 1:
             return None

@@ -64,7 +64,7 @@ DUE = np.dtype(
 """A row that must be copied to a zone as a ghost."""
 
 BATCH_SIZE = 512
-"""Size of a batch of rows to copy; larger than the greatest number of zones."""
+"""Size of a batch of rows to copy; larger than the largest number of zones."""
 
 UNREAD_LIMIT = 256
 """As soon as this many changes are unread, they are read. A tick adds at most one per vehicle."""
@@ -258,7 +258,7 @@ def _place_of(coming: NDArray[np.void], num: int, vehicle: int, target: int, epo
 
 @inlined_kernel
 def _next_crossed(near: NDArray[np.void], num: int, last: int) -> int:
-    """Return the entry of the crossed vehicle with the least id above `last`, or -1."""
+    """Return the entry of the crossed vehicle with the smallest id above `last`, or -1."""
     best = -1
     for n in range(num):
         entry = near[n]
