@@ -83,7 +83,7 @@ def leave() -> None:
 def nodes() -> list[Node]:
     """Return the live nodes of the cluster, the node of this process first."""
     ray = require("ray", "ray")
-    from ray._private.state import available_resources_per_node  # Ray has no public function
+    from ray._private.state import available_resources_per_node  # Ray has no public API for it
 
     free: dict[str, dict[str, float]] = available_resources_per_node()
     here = ray.get_runtime_context().get_node_id()

@@ -1,4 +1,4 @@
-"""Length of the leases of nodes: at most one step, because the commands of a step are known.
+"""Length of the leases of nodes: at most one step, since a step's commands are known in advance.
 
 A vehicle that crosses a border during a lease stays with its owner until the next lease. Only a
 vehicle with a record can be offered. A lease of 0 ticks first gives new vehicles their records.

@@ -12,7 +12,7 @@ from cavmarl.zones.kernels.visibility_scratch import VisibilityScratch
 
 @inlined_kernel
 def _num_next(roads: RoadArrays, lane: int, forwards: bool) -> int:
-    """Return the number of lanes after a lane (forwards), or of lanes before the lane (backwards)."""
+    """Return the number of lanes that follow a lane (forwards) or precede it (backwards)."""
     row = roads.lanes[lane]
     if not forwards:
         return int(row["num_into"])
