@@ -40,7 +40,7 @@ class PoseCounts:
     """Counts of the poses of a track."""
 
     received: int = 0
-    # poses that arrived after a newer pose (dropped), or later than a period and a step (used)
+    # poses that arrived after a newer pose (dropped), or over a period and a step late (used)
     late: int = 0
     lost: int = 0  # poses missing between two poses at the given rate
     extrapolated: int = 0  # steps without a pose for the end of the step

@@ -276,7 +276,7 @@ class CarlaSession:
     ) -> CarlaActor:
         """Add an actor; `pose` is relative to the parent, if there is one.
 
-        Raises CallRefused: there is no such blueprint or parent, or there are too many actors.
+        Raises CallRefused: there is no such blueprint or parent, or no room for the actor.
         """
         blueprint = BLUEPRINTS.get(type_id)
         if blueprint is None:

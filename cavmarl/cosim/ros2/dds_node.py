@@ -257,7 +257,7 @@ class DdsNode:
         fields = {field: described(node) for field, node in self._types.fields_of(kind)}
         cls = idl.make_idl_struct(f"{name}_", _dds_name(kind), fields)
 
-        # The signatures are the same as in Cyclone DDS's own classes.
+        # The signatures equal the signatures of Cyclone DDS's own methods.
         def serialize(
             self: Any, buffer: Any = None, endianness: Any = None, use_version_2: Any = None
         ) -> bytes:

@@ -71,7 +71,7 @@ def check_indices(what: str, found: Iterable[int] | NDArray[Any], count: int) ->
 
 
 def read_json(data: memoryview | bytes, kind: type[Any]) -> Any:
-    """Read a JSON value of a type from a frame. Raises MessageError: another type."""
+    """Read a JSON value of a type from a frame. Raises MessageError if the type differs."""
     try:
         value = json.loads(bytes(data))
     except (ValueError, RecursionError) as error:

@@ -40,7 +40,7 @@ class Watchdog:
         self._checks += 1
         self._stopped = self._stopped + 1 if state in "Tt" else 0
         is_still = state == "S"
-        if is_still:  # its descendants may work for the process
+        if is_still:  # descendants may work for the process
             for child, ticks in map(_read_state_if_there, descendants(self._pid)):
                 is_still &= child not in AT_WORK
                 spent += ticks
