@@ -96,5 +96,5 @@ def _rebalance(placement: Placement, method: str) -> tuple[Placement, str]:
 
 
 def _slack_s(placement: Placement) -> float:
-    """Return by how much a tick may exceed a perfect division to keep neighbours together."""
+    """Return how much longer than ideal a tick may be, in order to keep neighbours together."""
     return 0.5 * placement.problem.rule.tolerance * placement.fair_s

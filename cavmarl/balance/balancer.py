@@ -16,7 +16,7 @@ class Balancer:
     """Keeps the plan and the measured costs of the shards.
 
     Attributes:
-        plan: the present plan; reproducible from its own problem.
+        plan: the current plan; reproducible from its own problem.
 
     Raises:
         NoAdmissibleWorkerError: all workers are excluded.
@@ -46,15 +46,15 @@ class Balancer:
 
     def round(
         self,
-        snapshot: LoadSnapshot,  # load of the present workers
+        snapshot: LoadSnapshot,  # load of the current workers
         *,
         costs: tuple[ShardCost, ...] | None = None,  # default: the measured costs
-        rule: BalanceRule | None = None,  # default: the rule of the present plan
+        rule: BalanceRule | None = None,  # default: the rule of the current plan
     ) -> Plan:
         """Make the next plan: place lost shards, and move a few other shards if that saves time.
 
         Raises:
-            NoAdmissibleWorkerError: a worker is lost, and all others are excluded.
+            NoAdmissibleWorkerError: a worker is lost, and all other workers are excluded.
             ConfigError: there are more workers than shards, or a cost is invalid.
         """
         before = self.plan

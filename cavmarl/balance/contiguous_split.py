@@ -47,8 +47,8 @@ def shift_ends(
     """Shorten the piece of the slowest worker repeatedly.
 
     The slowest worker gives the shard at one of its ends to the adjacent worker. That worker may
-    pass a shard on to the next worker, and so on, until all are faster than the slowest was. Of the
-    possible changes, the one with the shortest makespan is made; on a tie, with the fewest moves.
+    pass a shard on to the next worker, and so on, until each is faster than the slowest worker was.
+    The change with the shortest makespan is made; on a tie, the change with the fewest moves.
     """
     left = max_moves
     while left > 0 and placement.makespan_s > until_s:

@@ -70,7 +70,7 @@ def _longest_s(placement: Placement) -> float:
 
 
 def _within(placement: Placement, limit_s: float) -> list[int] | None:
-    """Return pieces whose workers all keep the limit; None if shards remain."""
+    """Return pieces such that no worker exceeds the limit; None if shards remain."""
     workers = placement.workers
     homes: list[int] = []
     able = iter([worker for worker, is_open in enumerate(workers.is_open) if is_open])

@@ -1,7 +1,7 @@
 """`LoadScore`: ranks workers by load, and excludes overloaded workers.
 
     LoadScore_i = 0.6 CPU_i + 0.2 RAM_i + 0.2 GPU_i       eq. (1)
-    worker*     = arg min LoadScore_i over the admissible   eq. (2)
+    worker*     = arg min LoadScore_i over admissible workers eq. (2)
 
 after "Distributed CARLA architecture for multi-agent CAV simulation: design and preliminary
 multi-GPU evaluation", section 3.5. A worker that uses a resource above its threshold (CPU 0.85,

@@ -26,7 +26,7 @@ def refine(
 ) -> Placement:
     """Move shards off the slowest worker, or swap them with other workers' shards, while it helps.
 
-    A change helps if both workers are then faster than the slowest was. No shard moves to an
+    A change helps if it makes both workers faster than the slowest worker was. No shard moves to an
     excluded worker. If the rule `keeps_one` is set, no worker loses its last shard.
     """
     left = MOVES_A_SHARD * len(placement.homes) if max_moves is None else max_moves

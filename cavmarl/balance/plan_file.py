@@ -91,8 +91,8 @@ def plan_from_dict(document: object) -> Plan:
     for name, value in (("rule", asdict(found.rule)), ("snapshot", found.snapshot.to_dict())):
         if json.loads(json.dumps(value)) != json.loads(json.dumps(document[name])):
             raise ConfigError(
-                f"not a plan: {name} = {document[name]!r} lacks a key or has unknown ones; it must "
-                f"have {', '.join(value)}; make the plan again"
+                f"not a plan: {name} = {document[name]!r} lacks a key or has unknown keys; it "
+                f"must have {', '.join(value)}; make the plan again"
             )
     problem = Problem(
         shards=tuple(ShardCost(one.world, one.zone, one.cost_s) for one in found.shards),

@@ -1,4 +1,4 @@
-"""`Problem`: the input of a plan: costs, neighbours, workers, rules, present homes."""
+"""`Problem`: the input of a plan: costs, neighbours, workers, rules, current homes."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Problem:
     neighbors: tuple[tuple[int, ...], ...]  # zones that share a side with each zone
     snapshot: LoadSnapshot  # load of the workers
     rule: BalanceRule = field(default_factory=BalanceRule)  # rules for moving shards
-    # present worker of each shard, in the order of `shards`; None: none is placed yet
+    # current worker of each shard, in the order of `shards`; None: none is placed yet
     present: tuple[int, ...] | None = None
     # whether each worker must host one or more consecutive shards, in the order of workers, because
     # the results of all worlds are in one array

@@ -38,7 +38,7 @@ class DeadlineWatch:
         self.misses: dict[str, int] = {}
         self.worst_wall_s = 0.0
         self._now = now
-        self._limit: float | None = None  # of the present step, by the wall clock
+        self._limit: float | None = None  # deadline of the current step, by the wall clock
         self._phase = WORLD
         self._is_missed = False
 
@@ -49,7 +49,7 @@ class DeadlineWatch:
         self.note(WORLD)
 
     def note(self, phase: str) -> None:
-        """Note that a phase begins, and with it the end of the previous one."""
+        """Note that a phase begins, and that the previous phase has ended."""
         if self._limit is None:
             return
         if not self._is_missed and self._now() > self._limit:
@@ -58,7 +58,7 @@ class DeadlineWatch:
         self._phase = phase
 
     def end(self) -> None:
-        """End the present step, if there is one."""
+        """End the current step, if there is one."""
         if self._limit is None:
             return
         self.note("")

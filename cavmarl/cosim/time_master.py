@@ -39,7 +39,7 @@ class Pacer(Protocol):
 
 
 class Unpaced:
-    """Begins each step as soon as the previous one has ended."""
+    """Begins each step as soon as the previous step has ended."""
 
     def wait(self, elapsed_s: float) -> None:
         """Return at once."""
@@ -50,7 +50,7 @@ class Lateness:
     """The delay of steps, by the wall clock."""
 
     steps: int  # number of steps
-    # number of steps that began after they were due, because earlier ones took too long
+    # number of steps that began after they were due, because earlier steps took too long
     late: int
     mean_wall_s: float  # mean delay of all steps
     worst_wall_s: float  # maximum delay
@@ -158,7 +158,7 @@ class Steppable(Protocol):
 
 
 class ClockEvent(NamedTuple):
-    """A fault of the time."""
+    """An attempt of another caller to advance the world, successful or not."""
 
     tick: int  # the master's tick at detection
     # `own_tick`: a follower tried to tick; `drift`: a world was advanced without its master
@@ -344,7 +344,7 @@ class TimeMaster:
     def check_follower(self, follower: TimeFollower) -> None:
         """Check that a follower still follows.
 
-        Raises ClockError: it has left, or the master was released.
+        Raises ClockError: the follower has left, or the master was released.
         """
         if follower not in self._followers:
             raise ClockError(f"'{follower.name}' no longer follows; join again (TimeMaster.follow)")

@@ -120,7 +120,7 @@ class ZonedShards:
     def cut(self, partition: ZonePartition) -> None:
         """Change the zones between two ticks. Vehicles keep their owners, and ghosts are renewed.
 
-        A vehicle outside of its owner's new zone changes its owner later, as at a crossed border.
+        A vehicle outside of its owner's new zone changes its owner later, as at any border.
         """
         self.divide(partition)
         self._zoned.num_outer[...] = -1
@@ -129,7 +129,7 @@ class ZonedShards:
         for w in range(self.num_worlds):
             self._forget_offers(w)
         self._exchange(self._shards[0].worlds.rows, 0, self.num_worlds)
-        book.tick[:] = tick  # the rows are still those of this tick
+        book.tick[:] = tick  # the rows still belong to this tick
 
     def divide(self, partition: ZonePartition) -> None:
         """Set the zones. The caller must then set owners and ghosts."""
@@ -160,7 +160,7 @@ class ZonedShards:
         self.row_count()
 
     def let_gather(self, executor: Executor) -> bool:
-        """Let the shards renew their ghosts in the phase `gather`, if possible; return whether so.
+        """Let the shards renew ghosts in the phase `gather`, if possible; return whether they do.
 
         A shard that gathers reads all other shards. So this requires that all zones see each other.
         """

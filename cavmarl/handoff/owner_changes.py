@@ -83,7 +83,7 @@ class OwnerChanges:
         return place
 
     def give_up(self, w: int, zone: int, vehicle: int) -> None:
-        """Give a vehicle up to a zone of another process. Its row here becomes a ghost."""
+        """Hand a vehicle over to a zone of another process. Its row here becomes a ghost."""
         if not self._give_up(vehicle, zone, 0, self._division.zoned, self._division.side, w):
             raise ConfigError(f"zone {zone} does not own vehicle {vehicle}")
 
@@ -99,7 +99,7 @@ class OwnerChanges:
 
     @staticmethod
     def unseen(vehicle: int, zone: int) -> ConfigError:
-        """Return the error for a vehicle that enters a zone without a ghost of it."""
+        """Return the error for a vehicle that enters a zone without a ghost of the vehicle."""
         return ConfigError(
             f"vehicle {vehicle} entered zone {zone}, which has no ghost of it: the halo is too "
             "narrow; increase zones.halo_m"

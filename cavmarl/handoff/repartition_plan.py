@@ -27,7 +27,7 @@ class Proposal:
     """A proposed partition by measured cost."""
 
     partition: ZonePartition  # with as many zones as before
-    before: float  # present imbalance of the zones' costs, maximum / mean
+    before: float  # current imbalance of the zones' costs, maximum / mean
     after: float  # imbalance with the proposed zones
     moved: int  # number of vehicles whose zone would have a different number
 
@@ -44,7 +44,7 @@ def vehicle_costs(
 
 def propose_zones(
     network: RoadNetwork,
-    partition: ZonePartition,  # the present zones
+    partition: ZonePartition,  # the current zones
     positions: Floats,  # (n, 2) x and y of vehicles in m
     costs_s: Sequence[float],  # measured cost of each zone in seconds per tick
     *,

@@ -1,7 +1,7 @@
 """`Repartitioner`: new zones for running worlds whose vehicles are unevenly distributed.
 
 Repartitioning is off by default. The zones change between two ticks. In the next tick, each vehicle
-outside of its owner's new zone is handed over as at any border. So the results do not change.
+outside of its owner's new zone is handed over, as at any border. So the results do not change.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Repartition(NamedTuple):
 def propose_cut(
     network: RoadNetwork,
     division: ZonedShards,  # has the vehicles of all zones
-    partition: ZonePartition,  # the present zones
+    partition: ZonePartition,  # the current zones
     tolerance: float,  # required decrease of the imbalance
 ) -> Proposal | None:
     """Return zones with a better balance of vehicles; None if the gain is within the tolerance."""

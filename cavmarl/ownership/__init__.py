@@ -2,6 +2,6 @@
 
 See docs/explanation/ownership.md. The package is pure: it uses only the standard library, without
 input or output, clocks, threads or random numbers. `Directory` is the coordinator's side, and
-`Endpoint` is the side of a zone host. Both receive messages and return actions. `handoff` and
-`parallel` provide stores, journals and processes.
+`Endpoint` is the side of a zone host. Both classes receive messages and return actions. `handoff`
+and `parallel` provide stores, journals and processes.
 """

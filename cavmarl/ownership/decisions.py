@@ -33,7 +33,7 @@ class Neighbours(NamedTuple):
         """Return whether the target of a change of owner is not a neighbour of the source.
 
         Raises:
-            ProtocolError: it is not a neighbour, and vehicles may not jump.
+            ProtocolError: the target is not a neighbour, and vehicles may not jump.
         """
         if target in self.near[source]:
             return False

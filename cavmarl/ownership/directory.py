@@ -1,4 +1,4 @@
-"""The coordinator's side of the protocol: the present and the next owner of each vehicle.
+"""The coordinator's side of the protocol: the current and the next owner of each vehicle.
 
 Each method returns an `Output`: records to append to the log, then messages to send. Only
 `Table.apply` carries out a record, so a coordinator that replays its log (`restore`) repeats all
@@ -46,7 +46,7 @@ SILENCE = Output()
 
 
 class ZonesError(ProtocolError):
-    """Zones have sent no DONE, or a wrong one.
+    """Zones have sent no DONE, or a wrong DONE.
 
     Attributes:
         zones: the zones at fault.
@@ -152,7 +152,7 @@ class Directory:
         return self._logged(Fence(self.table.episode, self.table.tick, zone, incarnation))
 
     def hosting(self, zone: int) -> Hosting:
-        """Return the data to load the zone's present host. This visits all vehicles."""
+        """Return the data to load the zone's current host. This visits all vehicles."""
         table = self.table
         owned = {vehicle: at[1] for vehicle, at in table.owners.items() if at[0] == zone}
         return Hosting(
@@ -163,7 +163,7 @@ class Directory:
 
     def begin(
         self,
-        # (vehicle, zone that contains it) of all vehicles, and no others, that are outside of their
+        # (vehicle, zone that contains it) of exactly the vehicles that are outside of their
         # owner's zone by more than the hysteresis
         movers: Iterable[tuple[int, int]],
         births: Iterable[Birth] = (),
@@ -353,7 +353,7 @@ class Directory:
 
 
 def make_step(table: Table, zone: int, store: CommittedStates, payload: bytes) -> Step:
-    """Return the STEP for a zone's present host in the tick in progress.
+    """Return the STEP for a zone's current host in the tick in progress.
 
     States are attached for vehicles whose switch is forced or whose state must be sent again.
     """

@@ -1,4 +1,4 @@
-"""The three distances at a border, and the least width of the overlap.
+"""The three distances at a border, and the minimum width of the overlap.
 
     approach      the owner begins to offer the vehicle                  PREPARE
     control       the vehicle is beyond the border and the hysteresis    SWITCH
@@ -37,7 +37,7 @@ class Distances:
 def needed_overlap_m(
     reach_m: float, hysteresis_m: float, limits: Limits, v_max_mps: float, dt_s: float
 ) -> float:
-    """Return the least overlap, B = R + h + (D + 1) · v_max · dt.
+    """Return the minimum overlap, B = R + h + (D + 1) · v_max · dt.
 
     A zone may keep a vehicle for D more ticks. It must see everything within `reach_m` of the
     vehicle, however far the vehicle has moved in that time.

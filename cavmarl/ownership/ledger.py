@@ -86,7 +86,7 @@ def tally(run: bytes, owned: Mapping[int, int]) -> OwnedTally:
 class SeenIds:
     """The ids that have been used in an episode: all ids below `floor`, and the ids in `above`.
 
-    The set is small if ids are assigned roughly in rising order.
+    The set is small if ids are assigned roughly in ascending order.
     """
 
     def __init__(self, floor: int = 0, above: Iterable[int] = ()) -> None:

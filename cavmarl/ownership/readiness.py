@@ -20,7 +20,7 @@ class Readiness:
     def ready(
         self, vehicle: int, zone: int, *, tick: int, epoch: int, incarnation: int, digest: bytes
     ) -> bool:
-        """Return whether the zone's present host has acknowledged exactly this state."""
+        """Return whether the zone's current host has acknowledged exactly this state."""
         found = self.held.get(tick, {}).get((vehicle, zone))
         return found == (incarnation, epoch, digest)
 

@@ -42,7 +42,7 @@ class Replicas:
         return State.PREPARED if vehicle in self.held else State.EMPTY
 
     def prepare(self, offer: Offer, tick: int, schema: int) -> Refusal | bool:
-        """Store a state. Return whether it is stored (False: it came too late), or the refusal."""
+        """Store a state. Return whether it is stored (False: it was too late), or the refusal."""
         held = self.held.get(offer.vehicle)
         if not self._newer(offer.vehicle, offer.epoch, tick):
             return held is not None and held[:3] == (offer.epoch, tick, offer.digest)

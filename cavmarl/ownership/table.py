@@ -51,7 +51,7 @@ class Table:
         self.hosts = dict.fromkeys(sorted(zones), (-1, 0))
         self.states = dict.fromkeys(self.hosts, State.UNHOSTED)  # zone → UNHOSTED, HOSTED or FENCED
         self.seen = SeenIds()  # vehicle ids that have been used in the episode
-        self.repeats: Counter[int] = Counter()  # zone → number of new hosts in the present tick
+        self.repeats: Counter[int] = Counter()  # zone → number of new hosts in the current tick
         self.plan: OwnershipPlan | None = None  # plan of the tick in progress, if any
         self.counts = dict.fromkeys(self.hosts, 0)
         self._tallies = dict.fromkeys(self.hosts, OwnedTally())
@@ -92,8 +92,8 @@ class Table:
     ) -> None:
         """Reach a later tick at once, as a BEGIN and a COMMIT with the same contents would.
 
-        The calling coordinator must have checked the changes, and must have them in its log, if
-        there is one.
+        The calling coordinator must have checked the changes, and must have written them to
+        its log, if any.
         """
         if self.plan is not None or self.deferred:
             raise ProtocolError(f"tick {self.tick + 1} is in progress; commit it first")
@@ -122,7 +122,7 @@ class Table:
             counts[zone] -= 1
             moves.append((vehicle, zone, epoch, False))
         # If there are more moves than vehicles, `tallies` counts all vehicles and ignores the
-        # moves. One surplus move is kept as a mark: every new vehicle also adds a move.
+        # moves. One surplus move is kept as a mark, since new vehicles also add moves.
         del moves[len(owners) + 1 :]
         self.tick = tick
 

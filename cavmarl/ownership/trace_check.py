@@ -1,9 +1,9 @@
 """Check of a trace by the rules of docs/explanation/ownership.md, without the protocol's code.
 
-The check accepts the traces of correct runs. It refuses a trace in which a vehicle has two owners
-or none, a switch begins although its target does not have the exact state (PREPARE < ACK < SWITCH <
-CONFIRM < RELEASE), a message is sent before its record is logged, or a tick is committed that a
-present host has not computed.
+The check accepts the traces of correct runs. It refuses a trace if a vehicle has two owners or
+none; if a switch begins before its target has the exact state (PREPARE < ACK < SWITCH < CONFIRM <
+RELEASE); if a message is sent before its record is logged; or if a tick is committed before the
+current hosts have computed it.
 
 The cost of a tick grows with its changes: vehicles that keep their owner are not visited.
 """
@@ -251,7 +251,7 @@ class TraceChecker:
     def _ack(self, message: Ack) -> None:
         process = (message.zone, message.incarnation)
         if self._incarnations.get(message.zone) != message.incarnation:
-            return  # from a replaced process; the trace has no further messages of that process
+            return  # sent by a replaced process, whose further messages the trace does not have
         for vehicle, epoch, digest in message.entries:
             holding = (*process, vehicle, epoch, digest)
             known = holding in self._holdings.get(message.tick, ())

@@ -33,7 +33,7 @@ class TransferSummary:
     """Statistics of transfers, and of approaches without a transfer."""
 
     transfers: int  # number of changes of owner
-    forced: int  # transfers with the state attached, because no acknowledgement came in time
+    forced: int  # transfers with the state attached, because no acknowledgement arrived in time
     removed: int  # transfers of vehicles that left the world in the same tick
     deferred: int  # ticks that vehicles stayed with the old owner after crossing, summed
     refused: int  # states that a target refused

@@ -84,7 +84,7 @@ class TransferLog:
         clock: Callable[[], float] | None = None,  # returns the time in s; None: no clock
     ) -> None:
         self._clock = clock
-        self._begun_s: float | None = None  # when the record BEGIN came
+        self._begun_s: float | None = None  # when the record BEGIN arrived
         self.episode = -1  # episode of the newest record
         self.ask: Callable[[], None] = lambda: None
         self._rows: deque[Transfer] = deque(maxlen=KEPT_ROWS)

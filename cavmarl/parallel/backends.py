@@ -35,7 +35,7 @@ class MakeWorlds(Protocol):
         base_dir: Path,  # folder of relative paths
         num_worlds: int,  # W
         workers: int | None,  # N of `backend="name:N"`, None for `backend="name"`
-        in_next_step: bool,  # when new episodes start; see `SteppedWorlds`
+        in_next_step: bool,  # whether new episodes start a step later; see `SteppedWorlds`
     ) -> SteppedWorlds:
         """Make worlds that are stepped together."""
         ...
@@ -71,7 +71,7 @@ def make_worlds(
     base_dir: Path,  # folder of relative paths
     num_worlds: int,  # W
     backend: BackendName,
-    in_next_step: bool = False,  # when new episodes start; see `SteppedWorlds`
+    in_next_step: bool = False,  # whether new episodes start a step later; see `SteppedWorlds`
 ) -> SteppedWorlds:
     """Make worlds.
 
@@ -101,7 +101,7 @@ def _check_simulators(world: World, num_worlds: int, backend: BackendName) -> No
     """Check that the processes of a backend can run zones in other simulators.
 
     Raises:
-        ConfigError: the backend does not support a setting of such zones, or servers are missing.
+        ConfigError: the backend does not support a setting of these zones, or servers are missing.
     """
     config = world.config
     check_servers(hosted_zones(config.zones.simulators, world.partition.count), num_worlds)

@@ -57,7 +57,7 @@ class RegisteredOutputs:
                 self._write_agents(network, rows, np.flatnonzero(owned), w, outputs)
 
     def _network_of(self, worlds: Worlds, w: int) -> RoadNetwork:
-        """Return the roads of a world, with its present lanes."""
+        """Return the roads of a world, with its current lanes."""
         if not self._may_change:
             return self._network
         if w not in self._networks:

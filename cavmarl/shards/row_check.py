@@ -144,7 +144,7 @@ class RowCheck:
     def wrong(
         self,
         rows: NDArray[np.void],  # VEHICLE (n,)
-        tail: NDArray[np.void] | None = None,  # PLAN (n,) the last steps; None: the present steps
+        tail: NDArray[np.void] | None = None,  # PLAN (n,) replaces the last steps; None: no change
         num_orders: int = MOST,  # number of orders in the world's demand
     ) -> str:
         """Return what is wrong with one of these vehicles of one world; empty if nothing."""
@@ -166,7 +166,7 @@ class RowCheck:
         wrong |= rows["height"] > self._height_m
         if not wrong.any():
             return ""
-        return _of(rows[np.argmax(wrong)], "length", "fits no type with width and height")
+        return _of(rows[np.argmax(wrong)], "length", "fits no type with this width and height")
 
     def _wrong_goals(self, rows: NDArray[np.void]) -> str:
         """Check that `goal` names a plan, a detour or a frame of a script, as the driver needs."""

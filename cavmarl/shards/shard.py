@@ -48,7 +48,7 @@ SUGGESTED_HORIZON_S = 1.0  # time in which a suggested target speed should be re
 # The state of one actuated signal program in a world.
 CONTROLLER = np.dtype(
     [
-        ("phase", np.int64),  # index of the present PHASE row
+        ("phase", np.int64),  # index of the current PHASE row
         ("since_ms", np.int64),  # time since the reset at which the phase began
         ("next_ms", np.int64),  # time of the next decision whether the phase continues
     ],

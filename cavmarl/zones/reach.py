@@ -26,8 +26,8 @@ def driving_reach_m(network: RoadNetwork, travel: TripTables) -> float:
 
     A driver looks `view_m` ahead. On a junction, or with a stop line within `see_m`, it also
     considers vehicles that approach the junction and vehicles after it. Vehicles approach if they
-    are within `APPROACH_M` of the end of a lane that leads to the junction or is on it, or within
-    `MERGES_M` where vehicles turn into a lane. After the junction, the limit is `EXIT_LOOK_M`.
+    are within `APPROACH_M` of the end of a lane that leads to the junction or is on it; where
+    vehicles turn into a lane, the limit is `MERGES_M`. After the junction, it is `EXIT_LOOK_M`.
     """
     longest_m = float(network.links["length_m"].max(initial=0.0))
     junction_m = max(travel.see_m, longest_m)
@@ -42,7 +42,7 @@ def driving_reach_m(network: RoadNetwork, travel: TripTables) -> float:
 def longest_move_m(network: RoadNetwork, travel: TripTables, dt: float) -> float:
     """Return an upper bound, in m, of a vehicle's move in a tick of `dt` seconds.
 
-    The bound includes the motion along the lane at the greatest possible speed, the lateral motion
+    The bound includes the motion along the lane at the highest possible speed, the lateral motion
     of a lane change, and jumps at kinks of the map's lines and at junctions. In a hairpin, the
     centre of a body is on the chord between its bumpers, up to half its length off the lane.
     """
@@ -95,7 +95,7 @@ def _ends(network: RoadNetwork) -> tuple[NDArray[np.float64], NDArray[np.float64
 
 
 def _across_m(network: RoadNetwork) -> float:
-    """Return the greatest distance from a lane's end to its exit or to a foe's lane."""
+    """Return the largest distance from a lane's end to its exit or to a foe's lane."""
     links = network.links
     starts, ends = _ends(network)
     leaves = ends[links["from_lane"]]
@@ -113,7 +113,7 @@ def _across_m(network: RoadNetwork) -> float:
 
 
 def _jumps(network: RoadNetwork) -> tuple[float, float]:
-    """Return the greatest ratio of plane to road distance, and the longest jump in m."""
+    """Return the largest ratio of plane to road distance, and the longest jump in m."""
     links = network.links[network.links["first_internal"] < 0]
     starts, ends = _ends(network)
     jump = ends[links["from_lane"]] - starts[links["to_lane"]]

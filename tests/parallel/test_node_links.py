@@ -253,7 +253,7 @@ def test_a_node_that_does_not_return_an_action_of_another_node_is_lost() -> None
     others.add(0, TcpConnection(far))
     pong = Pong([COORDINATOR], [], [], [0])
     others.send(0, FrameKind.PONG, 1, [json.dumps(pong).encode()])
-    with pytest.raises(SilentNodeError, match="it has not refused others' actions") as lost:
+    with pytest.raises(SilentNodeError, match="it has not refused foreign actions") as lost:
         seen.wait([0], 0.0, wait)
     assert lost.value.peer == 0
     others.send(0, FrameKind.PONG, 1, [json.dumps(pong._replace(agents=[2])).encode()])

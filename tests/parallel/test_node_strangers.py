@@ -96,7 +96,7 @@ def test_another_version_of_the_handshake_is_refused() -> None:
             assert stranger.recv(100) == b"cavW" + VERSION.to_bytes(2, "little")
     with socket.create_server(("127.0.0.1", 0)) as server:
         answering = answer(server, b"cavW\x63\x00")
-        with pytest.raises(MessageError, match=f"version 99 of .*, this one has {VERSION}"):
+        with pytest.raises(MessageError, match=f"version 99 of .*, this process has {VERSION}"):
             call(server.getsockname()[:2], b"a" * 32, ANYONE)
         answering.join()
 

@@ -357,7 +357,7 @@ def test_calls_that_need_the_worlds_in_this_process_are_refused(make: Make) -> N
     with pytest.raises(ConfigError, match="cannot be copied"):
         vec.worlds.__reduce__()
     vec.reset(seed=0)
-    with pytest.raises(ConfigError, match="the state is one of other worlds"):
+    with pytest.raises(ConfigError, match="the state belongs to other worlds"):
         vec.worlds.load_worlds([b"nothing"])
     vec.step(vec.suggest_actions())
 
@@ -387,7 +387,7 @@ def test_a_node_that_is_killed_or_stopped_before_it_begins_is_replaced(
     assert sorted(started) == [0, 0, 1, 1]
     assert same(drive(vec), whole)
     started.clear()
-    words = "ended with exit status -9 before it had begun; it was killed, .*workers.max_retries"
+    words = "ended with exit status -9 before it had begun work; it was killed, .*max_retries"
     with pytest.raises(WorkerError, match=words):
         make("grid4x4", zones=4, nodes=2, overrides={"workers.max_retries": 1}, **WANTED)
 

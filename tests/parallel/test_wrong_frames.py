@@ -174,7 +174,7 @@ def drop(frame: Sent) -> Sent:
         (FrameKind.MESSAGES, add_number(1), "a frame of kind MESSAGES is of generation 1, not 0"),
         (FrameKind.SHARE, as_kind(FrameKind.REFUSED), "must not send frames of kind REFUSED"),
         (FrameKind.SHARE, as_kind(FrameKind.GIVE), "a frame of kind GIVE is of generation"),
-        (FrameKind.SHARE, as_kind(FrameKind.SYNC), "it claims an order to recover"),
+        (FrameKind.SHARE, as_kind(FrameKind.SYNC), "it claims that a recovery was ordered"),
     ],
 )  # fmt: skip
 def test_the_sender_of_a_wrong_frame_number_or_kind_is_lost(
@@ -252,8 +252,8 @@ def read_arrays(data: bytes) -> list[NDArray[Any]]:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (replace_content(b""), "the state is one of other worlds"),
-        (lambda frame: frame._replace(data=frame.data[:-8]), "the state is one of other worlds"),
+        (replace_content(b""), "the state belongs to other worlds"),
+        (lambda frame: frame._replace(data=frame.data[:-8]), "the state belongs to other worlds"),
         (add_number(1), "it sends SHARE before an awaited frame"),
         (add_number(1 << 40), "it sends SHARE before an awaited frame"),
         (move_to_foreign_zone, "its state has vehicles of zones"),

@@ -60,8 +60,8 @@ class ClientActor:
 
     Attributes:
         client: name of the client or the trace.
-        order: what the client has asked for.
-        track: its poses.
+        order: the actor that the client has requested.
+        track: poses of the actor.
         slot: slot of the external vehicle; -1: not in the world.
     """
 
@@ -69,15 +69,15 @@ class ClientActor:
     order: ActorOrder
     track: PoseTrack
     slot: int = -1
-    controls: tuple[float, float] | None = None  # of the next step, in [-1, 1]
+    controls: tuple[float, float] | None = None  # controls of the next step, in [-1, 1]
 
     @property
     def name(self) -> str:
-        """The name that its client has given it."""
+        """The name that the client has given the actor."""
         return self.order.name
 
     def report(self) -> dict[str, Any]:
-        """Return its name, type and poses for a report."""
+        """Return the actor's name, type and counts of poses, for a report."""
         return {
             "client": self.client,
             "name": self.name,
@@ -112,7 +112,7 @@ class ClientActors:
     def join(self, client: str, orders: Iterable[ActorOrder]) -> list[ClientActor]:
         """Bring actors into the world with the next step, or with the first reset.
 
-        If the world refuses an actor, it takes none of them.
+        If the world refuses one of the actors, none of them is added.
 
         Raises:
             ActionError: a name, type, place, size, rate or sensor is invalid, or the place is
@@ -178,7 +178,7 @@ class ClientActors:
 
         Args:
             actor: an actor that is moved by controls.
-            controls: throttle and steering in [-1, 1], scaled as those of agents.
+            controls: throttle and steering in [-1, 1], scaled as the controls of agents.
 
         Raises:
             ActionError: the actor is not moved by controls, or the controls are not two numbers.
@@ -235,14 +235,14 @@ class ClientActors:
         """Return the track of a new actor. Raises ActionError or ConfigError."""
         if not order.name or len(order.name) > MOST_NAME or not order.name.isprintable():
             raise ActionError(
-                f"an actor's name is {order.name[:MOST_NAME]!r}: must be 1 to {MOST_NAME} letters "
-                "that can be printed"
+                f"an actor's name is {order.name[:MOST_NAME]!r}: must be 1 to {MOST_NAME} "
+                "printable characters"
             )
         if order.name in self._env.possible_agents:
             raise ActionError(f"an actor's name is '{order.name}', an agent's; use another")
         if len(order.vtype) > MOST_NAME:
             raise ActionError(
-                f"an actor's type has {len(order.vtype)} letters; the limit is {MOST_NAME}"
+                f"an actor's type has {len(order.vtype)} characters; the limit is {MOST_NAME}"
             )
         if order.moved_by not in MOVERS:
             raise ActionError(

@@ -154,7 +154,7 @@ def _trace(
 
 
 def _type_of(path: Path, vclass: str | None) -> str:
-    """Return the type of a class. Raises ConfigError: it is not the number of a class."""
+    """Return the type of a class. Raises ConfigError: `vclass` is not the number of a class."""
     if not vclass:
         return "car"
     if vclass not in map(str, range(CLASS_PEDESTRIAN + 1)):

@@ -1,4 +1,4 @@
-"""`PoseTrack`: poses with a rate of their own, and the pose that follows from them at any time.
+"""`PoseTrack`: poses of a body, received at any rate, and the extrapolated pose at any time.
 
 Poses arrive at 10 to 100 Hz, and the world steps at another rate. For the end of a step, the track
 extrapolates the newest pose with the motion of the last two poses: the velocity turns with the
@@ -27,12 +27,12 @@ class PoseSample(NamedTuple):
     """A measured pose of a body."""
 
     stamp_s: float  # simulated time since the reset
-    x: float  # of its centre, m
+    x: float  # position of the body's centre, m
     y: float
     heading: float  # rad, counter-clockwise from east
-    z: float | None = None  # height of the ground below its centre, m; None: the lane's
+    z: float | None = None  # height of the ground below the centre, m; None: the lane's height
     pitch: float | None = None  # rad, positive uphill; None: the slope of the lane
-    speed: float | None = None  # m/s along the heading; None: follows from the move
+    speed: float | None = None  # m/s along the heading; None: computed from the motion
 
 
 @dataclass
@@ -40,7 +40,7 @@ class PoseCounts:
     """Counts of the poses of a track."""
 
     received: int = 0
-    # older than a newer pose, so dropped; or older than one period and one step, but used
+    # poses that arrived after a newer pose (dropped), or over a period and a step late (used)
     late: int = 0
     lost: int = 0  # poses missing between two poses at the given rate
     extrapolated: int = 0  # steps without a pose for the end of the step

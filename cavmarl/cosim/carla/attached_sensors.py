@@ -200,7 +200,7 @@ class _Mounted:
     every_s: float
     due_s: float = 0.0
     last_s: float | None = None
-    is_heard: bool = False  # it has had a listener
+    is_heard: bool = False  # whether a client has listened to the sensor
     added_wall_s: float = field(default_factory=time.monotonic)
 
 
@@ -215,7 +215,7 @@ class SensorSuite:
         self._added = 0  # number of sensors added in this episode
 
     def begin_episode(self) -> None:
-        """Let the next sensors draw the random numbers of a first episode."""
+        """Give the next sensors the same random numbers as in the first episode."""
         self._added = 0
 
     def add(self, actor: CarlaActor) -> None:
@@ -237,9 +237,9 @@ class SensorSuite:
             self._streams.end(mounted.stream)
 
     def await_listeners(self) -> None:
-        """Wait again for clients that listen soon, after a slow restart of the world.
+        """Restart the time in which `are_listeners_due` expects listeners of new sensors.
 
-        See `are_listeners_due`.
+        The restart of a world may have taken longer than that time.
         """
         for mounted in self._mounted.values():
             mounted.added_wall_s = time.monotonic()
@@ -254,9 +254,9 @@ class SensorSuite:
         return False
 
     def last_collisions(self, actor: CarlaActor) -> Iterator[tuple[int, CarlaActor, int, bytes]]:
-        """Yield frames, as `sense`, of a vehicle that leaves the world after a collision.
+        """Yield frames of a vehicle that leaves the world after a collision; see `sense`.
 
-        The other vehicle is the nearest one.
+        The other vehicle is taken to be the nearest vehicle.
         """
         session = self._context.session
         states = session.actors.vehicle_states

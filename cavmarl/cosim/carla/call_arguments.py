@@ -72,7 +72,7 @@ def listed(check: Check, most: int = 1 << 16) -> Check:
 
 
 def record_of(*checks: Check, required: int | None = None) -> Check:
-    """Return a check for a list of fields, of which the first `required` must be there."""
+    """Return a check for a list of fields; the first `required` fields must be present."""
     fewest = len(checks) if required is None else required
 
     def checked(value: Any) -> tuple[Any, ...]:

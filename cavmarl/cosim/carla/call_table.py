@@ -47,7 +47,7 @@ class ClientCall:
 
     Attributes:
         checks: checks of the arguments.
-        required: number of arguments that must be there; other versions add or omit some.
+        required: number of necessary arguments; other versions add or omit arguments.
         act: called with the caller, the session and the checked arguments; None: the call
             returns `constant`.
         note: remark for the reference page; for a refused call, the reason.

@@ -74,8 +74,8 @@ class CarlaActor:
     """One actor.
 
     Attributes:
-        attributes: values by name; kinds are those of the blueprint.
-        pose: the present pose; for vehicles and walkers, see `ActorTable.pose_of`.
+        attributes: values by name; kinds as in the blueprint.
+        pose: the current pose; for vehicles and walkers, see `ActorTable.pose_of`.
         local: pose relative to the parent.
         centre, half_m: the bounding box in the actor's frame.
         vehicle: id of the row of a vehicle or walker; -1: none.
@@ -124,7 +124,7 @@ class ActorTable:
     """The actors of one episode, and their states as records of a snapshot.
 
     `first_number`: number of the first actor, larger than all numbers of earlier episodes, because
-    clients remember actors by their numbers. `next_number`: least number of the first vehicle.
+    clients remember actors by their numbers. `next_number`: smallest number of the first vehicle.
     `known`: actors of vehicles that may appear, by the ids of the vehicles.
     """
 
@@ -156,7 +156,7 @@ class ActorTable:
         return self._next
 
     def skip_to(self, number: int) -> None:
-        """Give the next actors this number or higher ones."""
+        """Number the next actors from this number on, or from a higher number."""
         self._next = max(self._next, number)
 
     @property
@@ -192,7 +192,7 @@ class ActorTable:
         return actor
 
     def remove(self, number: int) -> list[CarlaActor]:
-        """Remove an actor and those attached to it; return them."""
+        """Remove an actor and all actors attached to it; return the removed actors."""
         actor = self.actors.pop(number, None)
         if actor is None:
             return []
@@ -284,7 +284,7 @@ class ActorTable:
                 yield actor
 
     def take(self, world: HostedWorld) -> list[CarlaActor]:
-        """Take over the present state of a world; return the actors that have gone."""
+        """Take over the current state of a world; return the removed actors."""
         rows = world.rows
         gone: list[CarlaActor] = []
         if not np.array_equal(rows["id"], self._ids):
@@ -347,7 +347,7 @@ class ActorTable:
         ids = world.external.ids()
         for actor in [one for one in self.actors.values() if one.slot >= 0]:
             vehicle = ids.get(actor.slot, -1)
-            if actor.vehicle != vehicle:  # it has entered, or has jumped
+            if actor.vehicle != vehicle:  # the vehicle has entered, or has a new id after a jump
                 self._by_vehicle.pop(actor.vehicle, None)
                 actor.vehicle = vehicle
                 if vehicle >= 0:
@@ -409,7 +409,7 @@ class ActorTable:
         states["turn"][:, 1] = -np.degrees(heading)
         states["velocity"] = ahead * speed[:, None]
         states["spin"][:, 2] = -np.degrees(rows["yaw_rate"])
-        turning = speed * rows["yaw_rate"]  # to the left
+        turning = speed * rows["yaw_rate"]  # acceleration to the left
         states["acceleration"] = ahead * accel[:, None] - aside * turning[:, None]
         states["throttle"] = np.clip(accel / THROTTLE_MPS2, 0.0, 1.0)
         states["brake"] = np.clip(-accel / BRAKE_MPS2, 0.0, 1.0)
@@ -425,7 +425,7 @@ class ActorTable:
         self._write_walkers(ahead, speed)
 
     def _write_lanes(self, world: HostedWorld, rows: NDArray[np.void]) -> None:
-        """Write the present speed limit and the traffic light of each vehicle's lane."""
+        """Write the current speed limit and the traffic light of each vehicle's lane."""
         states, lanes = self.vehicle_states, world.present_lanes
         lane = rows["lane"]
         states["speed_limit"] = 3.6 * lanes["speed_mps"][lane]

@@ -1,6 +1,6 @@
 """The blueprints that clients can choose from, with CARLA's ids, attributes and default values.
 
-Client programs draw from the recommended values of each attribute that can be changed, so each such
+Client programs choose recommended values of changeable attributes at random, so each changeable
 attribute has at least one value.
 """
 
@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from cavmarl.sensors.kernels.panorama import BICYCLE, BUS, CAR, MOTORCYCLE, PEDESTRIAN, TRAM, TRUCK
 
-WALKER, PROP = "pedestrian", "prop"  # values of `Blueprint.base_type` beside CARLA's
+WALKER, PROP = "pedestrian", "prop"  # values of `Blueprint.base_type` in addition to CARLA's
 
 Kind = Literal["bool", "int", "float", "string", "colour"]
 
@@ -22,7 +22,7 @@ _BOTH = ("true", "false")
 
 @dataclass(frozen=True)
 class BlueprintAttribute:
-    """An attribute, its default value, and the values from which programs draw."""
+    """An attribute, its default value, and the values from which programs choose."""
 
     name: str
     kind: Kind

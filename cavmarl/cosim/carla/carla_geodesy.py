@@ -1,7 +1,7 @@
 """Latitudes and longitudes of places, as each version of the client computes them.
 
 All versions treat the earth as a sphere. Client 0.9.16 uses a transverse Mercator projection with a
-scale of 0.9996, and its latitude grows to the south. The others use a Mercator projection.
+scale of 0.9996, and its latitude increases to the south. Other versions use a Mercator projection.
 """
 
 from __future__ import annotations

@@ -171,8 +171,8 @@ def _ids_of_signals(document: str) -> dict[str, str]:
 def spawn_points(network: RoadNetwork) -> list[CarlaPose]:
     """Return poses on lanes that cars may use, `SPAWN_HEIGHT_M` above the road.
 
-    Programs draw starts and destinations from them. If the lanes that lead to each other have at
-    least half of the poses, there are no poses on other lanes, such as those that leave the map.
+    Programs choose starts and destinations at random from these poses. If the largest set of lanes
+    that can all reach each other has at least half of the poses, the other poses are left out.
     """
     found: list[CarlaPose] = []
     lanes: list[int] = []
@@ -191,7 +191,7 @@ def spawn_points(network: RoadNetwork) -> list[CarlaPose]:
 
 
 def _in_largest_part(network: RoadNetwork) -> NDArray[np.bool_]:
-    """Return (lanes,) whether a lane is in the largest part in which cars can reach each lane."""
+    """Return (lanes,) whether a lane is in the largest strongly connected component for cars."""
     lanes, links = network.lanes, network.links
     for_cars = (lanes["permissions"] & CARS) != 0
     arcs = [np.stack([links["from_lane"], links["to_lane"]], axis=1)]
@@ -200,7 +200,7 @@ def _in_largest_part(network: RoadNetwork) -> NDArray[np.bool_]:
         arcs.append(np.stack([there, lanes[side][there]], axis=1))
     joined = np.concatenate(arcs).astype(np.int32)
     part = strong_components(len(lanes), joined[for_cars[joined].all(axis=1)])
-    part[lanes["internal"] | ~for_cars] = len(lanes)  # in no part
+    part[lanes["internal"] | ~for_cars] = len(lanes)  # in no component
     found: NDArray[np.bool_] = part == np.bincount(part)[: len(lanes)].argmax()
     return found
 

@@ -1,6 +1,6 @@
 """`CarlaRecorder`: CARLA's recorder. Its files are recordings of cavmarl, with a list of actors.
 
-A recording is a folder that `cavmarl replay` reads, too (docs/guides/recordings.md). The file
+A recording is a folder, which `cavmarl replay` also reads (docs/guides/recordings.md). The file
 `carla_actors.jsonl` in it has one line for the session and one for each vehicle or walker.
 """
 
@@ -40,7 +40,7 @@ _NOWHERE = CarlaPose(0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class RecordedActor:
-    """A vehicle, walker or prop of a recording; its fields are those of `CarlaActor`."""
+    """A vehicle, walker or prop of a recording; fields as in `CarlaActor`."""
 
     vehicle: int
     number: int
@@ -64,7 +64,7 @@ class RecordedActor:
 
     @classmethod
     def read(cls, given: Any) -> RecordedActor:
-        """Return an actor from the values of a line. Raises ValueError for others."""
+        """Return an actor from the values of a line. Raises ValueError: they are invalid."""
         attributes, vectors = given["attributes"], (given["centre"], given["half_m"])
         texts = [given["type_id"], *attributes, *attributes.values()]
         vehicle, number = given["vehicle"], given["number"]
@@ -82,7 +82,7 @@ class RecordedActor:
         return cls(vehicle, number, given["type_id"], attributes, *boxes, given["tags"])
 
     def actor(self, number: int) -> CarlaActor:
-        """Return the actor, with the number that it gets."""
+        """Return the actor, with a given number."""
         return CarlaActor(
             number,
             self.type_id,
@@ -208,7 +208,7 @@ class CarlaRecorder:
         return path
 
     def take(self, session: CarlaSession, ended: Sequence[EndedVehicle] = ()) -> None:
-        """Record the present state of the world, if a recording has begun.
+        """Record the current state of the world, if a recording has begun.
 
         `ended`: the agents' vehicles that have left in this tick.
         """
@@ -243,7 +243,7 @@ class CarlaRecorder:
             try:
                 writer.close()
             except CavmarlError as problem:
-                log.warning("the recording is not whole: %s", problem)
+                log.warning("the recording is incomplete: %s", problem)
 
     def _write(self, **values: Any) -> None:
         assert self._list is not None

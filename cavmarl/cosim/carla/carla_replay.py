@@ -1,4 +1,4 @@
-"""`CarlaReplay`: the states of a recording, shown to clients instead of those of the world."""
+"""`CarlaReplay`: the states of a recording, shown to clients instead of the states of the world."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class CarlaRecording:
 
     @property
     def started(self) -> str:
-        """Date and time of its start."""
+        """Date and time at which the recording started."""
         return str(self._recording.manifest.get("started", "unknown"))
 
     def check_map(self, network: RoadNetwork, name: str) -> None:
@@ -133,7 +133,7 @@ class CarlaReplay:
         capacity: largest number of vehicles of the world.
 
     Attributes:
-        rows: VEHICLE (n,) at the present time of the replay.
+        rows: VEHICLE (n,) at the current time of the replay.
         signals: the signals at this time, see `Worlds.signal_phase`.
         is_over: whether the end has been reached.
         factor: recorded time per simulated time.
@@ -160,8 +160,8 @@ class CarlaReplay:
             )
         if recording.most_rows > capacity:
             raise RecordingError(
-                f"{recording.name}: has {recording.most_rows} vehicles at a time, and this world "
-                f"room for {capacity}; start the server with more vehicles (--set "
+                f"{recording.name}: has {recording.most_rows} vehicles at a time, but this world "
+                f"has room for {capacity}; start the server with more vehicles (--set "
                 "population.external=N)"
             )
         self._type_of = _types_of(recording, types)
@@ -203,7 +203,7 @@ class CarlaReplay:
 
 
 def nearest_to(row: int, rows: NDArray[np.void]) -> int:
-    """Return the id of the vehicle that is nearest to the one of a row; -1: there is no other."""
+    """Return the id of the vehicle nearest to the vehicle of a row; -1: no other vehicle."""
     apart_m = np.hypot(rows["x"] - rows["x"][row], rows["y"] - rows["y"][row])
     apart_m[row] = np.inf
     nearest = int(apart_m.argmin())

@@ -50,7 +50,7 @@ CALL_MODULES = (
     episode_calls,
     light_calls,
     recorder_calls,
-)  # importing them fills the table of calls
+)  # importing these modules fills the table of calls
 _LATE_S = 0.5  # a free-running world does not catch up on longer delays
 _PATIENCE_S = 0.05  # how long a tick waits for listeners of new sensors
 _LOOK_S = 0.0005
@@ -117,7 +117,7 @@ class ClientConnection(asyncio.Protocol):
             transport.write(pack_answer(request.number, error, result))
 
     def _must_wait(self, request: Request) -> bool:
-        """Return whether a request is a tick for which listeners may still come."""
+        """Return whether a request is a tick that must wait for listeners of new sensors."""
         is_tick = request.name == "tick_cue" or (
             request.name == "apply_batch" and request.arguments[-1:] == [True]
         )
@@ -149,7 +149,7 @@ class CarlaServer:
         host: address to listen at.
         client: version of the clients.
         limits: limits of what clients may demand.
-        step_s: length of a step before a client has set one.
+        step_s: length of a step until a client sets it.
         other_ticks, recordings: see `CarlaSession`.
 
     Attributes:
@@ -253,7 +253,7 @@ def _two_sockets(host: str, port: int) -> tuple[socket.socket, socket.socket]:
 
 
 def warn_of_host(host: str) -> None:
-    """Log that other machines can connect, if they can."""
+    """Log a warning if other machines can connect."""
     if not is_loopback(host):
         log.warning(
             "%s: every program that reaches this address controls the world, because CARLA's "
@@ -285,7 +285,7 @@ def serve(
         any_host: must be set for an address that other machines can reach.
         client: version of the clients: `0.9.15`, `0.9.16` or `0.10.0`.
         limits: limits of what clients may demand.
-        other_ticks: what happens if a client ticks that is not the first one; see `CarlaSession`.
+        other_ticks: what happens if a client other than the first ticks; see `CarlaSession`.
         recordings: folder of the recordings that clients make; None: they can make none.
         map_file: the map of `env`, if it is an environment that is not in the library.
         told: called with the server when it listens.

@@ -89,10 +89,10 @@ class CarlaSession:
         streams: where snapshots and sensor frames are sent.
         limits: limits of what clients may demand.
         step_s: length of a step of the first world.
-        other_ticks: what happens in a synchronous world if a client ticks that is not the time
-            master: the client that has ticked first, until it disconnects. `obey`: the world
-            advances, as in CARLA. `refuse`: the client gets an error. `follow`: the client waits
-            for the next tick of the master.
+        other_ticks: what happens in a synchronous world if a client other than the time master
+            ticks. The time master is the client that ticked first, until it disconnects. `obey`:
+            the world advances, as in CARLA. `refuse`: the client gets an error. `follow`: the
+            client waits for the next tick of the master.
         recordings: folder of the recordings that clients make; None: they can make none.
 
     Attributes:
@@ -195,7 +195,7 @@ class CarlaSession:
             self._send(self.sensors.last_collisions(actor))
 
     def publish(self) -> None:
-        """Send the snapshot of the present frame, then the frames of sensors."""
+        """Send the snapshot of the current frame, then the frames of sensors."""
         keep = self.settings.synchronous
         if self.streams.is_wanted(EPISODE_STREAM):
             self.streams.send(EPISODE_STREAM, *self._snapshot(), keep)
@@ -203,7 +203,7 @@ class CarlaSession:
         self._send(self.sensors.sense())
 
     def _snapshot(self) -> tuple[bytes, bytes]:
-        """Return the head and the body of the snapshot of the present frame.
+        """Return the head and the body of the snapshot of the current frame.
 
         A client also gets it when it begins to listen: in a synchronous world, it would otherwise
         wait for a frame that was sent before its connection was open.
@@ -276,7 +276,7 @@ class CarlaSession:
     ) -> CarlaActor:
         """Add an actor; `pose` is relative to the parent, if there is one.
 
-        Raises CallRefused: there is no such blueprint, parent or room.
+        Raises CallRefused: there is no such blueprint or parent, or no room for the actor.
         """
         blueprint = BLUEPRINTS.get(type_id)
         if blueprint is None:
@@ -345,5 +345,5 @@ class CarlaSession:
         self.source.close()
 
     def forget(self, actor: CarlaActor) -> None:
-        """End the sensor of an actor that has gone."""
+        """End the sensor of an actor that has been removed."""
         self.sensors.remove(actor)

@@ -1,6 +1,6 @@
 """The differences between the versions of CARLA's client that a server must know.
 
-A client does not send its version, so the server is configured for one of these.
+A client does not send its version, so the server is configured for one version.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ class ClientVersion(NamedTuple):
     snapshot_kind: int  # number of a snapshot among the kinds of frames
     first_attribute_kind: int  # number of the attribute kind `bool`
     box_has_actor: bool  # a bounding box has a fourth field
-    has_wheel_physics: bool  # the layout of `VehiclePhysicsControl` is that of 0.9
+    has_wheel_physics: bool  # `VehiclePhysicsControl` has the layout of 0.9
     is_mercator: bool  # how places are projected; see `carla_geodesy`
 
 

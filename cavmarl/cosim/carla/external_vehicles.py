@@ -33,7 +33,7 @@ from cavmarl.env.parallel import CavEnv
 
 MASS_KG = 1845.0  # mass that clients read in the physics of each vehicle
 _OCCUPIED = "Spawn failed because of collision at spawn position"  # CARLA's text
-_VTYPE_OF_BASE = {"truck": "truck", "bus": "bus", WALKER: WALKER}  # all others are cars
+_VTYPE_OF_BASE = {"truck": "truck", "bus": "bus", WALKER: WALKER}  # all other types are cars
 _FASTEST_MPS = MAX_SPEED_MPS - 0.5  # a faster move to a pose is a jump
 _FASTEST_BACKWARD_MPS = 10.0
 
@@ -41,7 +41,7 @@ _FASTEST_BACKWARD_MPS = 10.0
 class ExternalBody(NamedTuple):
     """A vehicle, walker or static prop to spawn."""
 
-    type_id: str  # of its blueprint
+    type_id: str  # id of the blueprint
     base_type: str  # see `Blueprint.base_type`; a prop is a stopped vehicle
     pose: CarlaPose
     size_m: tuple[float, float, float]  # length, width, height
@@ -243,7 +243,7 @@ class ExternalVehicles:
             east, north = (one.velocity or self._velocity_of(slot))[:2]
             ahead, aside = east * cos - north * sin, -east * sin - north * cos
             if control is None and one.vtype != WALKER:
-                self.controls[slot] = CarlaControl()  # it keeps rolling
+                self.controls[slot] = CarlaControl()  # the vehicle keeps rolling
         if one.spin is not None:
             turn = -one.spin * step_s
         one.velocity = one.spin = None

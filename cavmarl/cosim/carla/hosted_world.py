@@ -59,7 +59,7 @@ class EndedVehicle(NamedTuple):
 
     agent: int
     events: int  # EVENT_* bits: why it has left
-    was_driven: bool  # by a client
+    was_driven: bool  # whether a client drove the vehicle
 
     @property
     def has_collided(self) -> bool:
@@ -132,7 +132,7 @@ class HostedWorld:
         return lanes
 
     def step(self, actions: Mapping[str, Any] | None = None) -> list[EndedVehicle]:
-        """Advance the world by one step, or begin the next episode if this one is over.
+        """Advance the world by one step, or begin the next episode if the episode is over.
 
         `actions`: actions of agents that no client drives; None: actions of the built-in driver.
 
@@ -204,7 +204,7 @@ class WorldSource(Protocol):
         """Return a world at the start of an episode.
 
         Args:
-            name: name of a map; empty: the present map.
+            name: name of a map; empty: the current map.
             step_s: length of a step.
 
         Raises CavmarlError: there is no such map, or the world cannot have such steps.
@@ -263,7 +263,7 @@ class GivenWorld:
 class LoadedWorlds:
     """The source of a server that loads environments by name.
 
-    `spec`: the first world, whose options hold whenever a client loads its map.
+    `spec`: the first world; its options also apply whenever a client loads its map again.
     """
 
     def __init__(self, spec: WorldSpec) -> None:

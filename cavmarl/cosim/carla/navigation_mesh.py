@@ -1,8 +1,8 @@
 """The navigation mesh of walkers: where the client's walkers may walk.
 
-The roads of the engine have no sidewalks, so the mesh has a strip on the outer side of each road, a
-corner between two strips at a junction, and a crosswalk before each junction. The client reads the
-mesh with Detour, as one tile. Detour's frame is (x, z, y) of the client's frame.
+The roads of the engine have no sidewalks. The mesh therefore has a strip along the outer side of
+each road, a corner between two strips at a junction, and a crosswalk before each junction. The
+client reads the mesh with Detour, as one tile. Detour's frame is (x, z, y) of the client's frame.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from cavmarl.cosim.carla.carla_session import CarlaSession
 
 _MOST_CHARACTERS = 1 << 22  # limit of a report
 _MOST_FACTOR = 1000.0
-_KINDS = {"vehicle": 1, "walker": 2}  # CARLA's numbers; all others are 0
+_KINDS = {"vehicle": 1, "walker": 2}  # CARLA's numbers; all other types are 0
 _LETTERS = {"h": "hero", "v": "vehicle", "w": "walker", "t": "light", "o": "other", "a": "any"}
 _NO_OFFSET = CarlaPose(0.0, 0.0, 0.0)
 _BEHIND = CarlaPose(-10.0, 0.0, 5.0, -25.0)  # spectator behind a vehicle
@@ -177,7 +177,7 @@ def _collision_lines(
     is_first: Callable[[RecordedActor], bool],
     is_second: Callable[[RecordedActor], bool],
 ) -> Iterator[str]:
-    """Yield the collisions of agents; the other vehicle is the nearest one."""
+    """Yield the collisions of agents; the other vehicle is taken to be the nearest vehicle."""
     actors = recording.session.actors
     for time_s, vehicle, frame in recording.collisions():
         row = int(np.flatnonzero(frame.vehicles["id"] == vehicle)[0])

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 class SensorSettings:
     """The attributes of a sensor as numbers. Raises CallRefused for other values.
 
-    `order`: number of sensors that the episode had before; it separates their random numbers.
+    `order`: number of earlier sensors in the episode, which selects the random numbers.
     """
 
     def __init__(self, actor: CarlaActor, order: int) -> None:
@@ -56,7 +56,7 @@ class SensorContext:
 
     @property
     def surroundings(self) -> Surroundings:
-        """The view of the present world."""
+        """The view of the current world."""
         world = self.session.world
         if self._surroundings is None or self._surroundings.world is not world:
             self._surroundings = Surroundings(world)
@@ -68,7 +68,7 @@ class SensorContext:
         return -1 if parent is None else parent.vehicle
 
     def hidden_carrier_of(self, actor: CarlaActor) -> int:
-        """Return the carrier of a camera that is in or above its body, which hides it, or -1."""
+        """Return the vehicle that a camera hides because it is in or above its body, or -1."""
         parent = self.session.actors.actors.get(actor.parent)
         if parent is None or actor.local is None:
             return -1
@@ -84,7 +84,7 @@ class SensorContext:
         return found
 
     def tagged(self, tags: NDArray[np.uint8], vehicles: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Return tags (n,) of vehicles' ids, of which some are props."""
+        """Return tags (n,) of vehicles' ids, with `PROP_TAG` for props."""
         props = self.session.actors.props
         if not props.size:
             return tags

@@ -28,11 +28,11 @@ class SessionRecordings:
         self._session = session
         self._recorder = CarlaRecorder(folder, session.limits.max_recorded)
         self._key = secrets.token_hex(8)  # no other session has it
-        self._live: _LiveActors | None = None  # during a replay
+        self._live: _LiveActors | None = None  # the actors of the world during a replay
         self._factor = 1.0
 
     def start(self, name: str) -> Path:
-        """Begin a recording; raises as `CarlaRecorder.start`."""
+        """Begin a recording. Raises the errors of `CarlaRecorder.start`."""
         self.refuse_in_replay()
         return self._recorder.start(self._session, self._key, name)
 
@@ -117,7 +117,7 @@ class SessionRecordings:
         return replay
 
     def set_replay_factor(self, factor: float) -> None:
-        """Set the recorded time per simulated time, of this replay and of later ones."""
+        """Set the recorded time per simulated time, for this replay and later replays."""
         self._factor = factor
         replay = self._session.world.replay
         if replay is not None:

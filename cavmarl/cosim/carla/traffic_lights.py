@@ -255,7 +255,7 @@ class TrafficLights:
                     self.times_s[light, column] = group.durations_s[shown].sum()
 
     def _write(self) -> None:
-        """Give the states that differ from those of the map's programs to the environment."""
+        """Pass the states that differ from the map's programs to the environment."""
         network = self._network
         links = network.links
         codes = np.full(len(links), SIGNAL_NONE, np.uint8)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cavmarl.config.action import ActionConfig
 
 FULL_STEER_RAD = math.radians(70.0)  # angle of the front wheels at steer = 1
-WHEELBASE_SHARE = 0.6  # of the length of CARLA's vehicles; agents' axles can be farther apart
+WHEELBASE_SHARE = 0.6  # wheelbase / length of CARLA's vehicles; agents' axles can be farther apart
 THROTTLE_MPS2 = 4.5  # acceleration at throttle = 1
 BRAKE_MPS2 = 8.0  # deceleration at brake = 1
 _ROLLING_MPS2 = 0.2  # deceleration without throttle, and its increase per m/s
@@ -63,7 +63,7 @@ def drives_backward(control: Control, speed_mps: float) -> bool:
 def backward_motion_of(control: Control, speed_mps: float) -> tuple[float, float]:
     """Return acceleration and wheel angle, as `motion_of`, of a vehicle with a speed of 0 or less.
 
-    In the reverse gear, throttle accelerates backwards; in others, it slows the vehicle.
+    In the reverse gear, throttle accelerates backwards; in other gears, it slows the vehicle.
     """
     if isinstance(control, AckermannControl):
         acceleration, angle = motion_of(
@@ -109,10 +109,10 @@ def action_of(
 
 
 def same_turn(angle_rad: float, times_wheelbase: float) -> float:
-    """Return the wheel angle that turns a longer vehicle as fast as `angle_rad` turns this one.
+    """Return the wheel angle that turns a longer vehicle as fast as `angle_rad` turns this vehicle.
 
-    Both are kinematic bicycles, see `driving.kernels.motion.bicycle`. The result is below a right
-    angle; a longer vehicle cannot follow each turn.
+    The vehicles are kinematic bicycles, see `driving.kernels.motion.bicycle`. The result is below a
+    right angle; a longer vehicle cannot follow each turn.
     """
     slip = math.atan(0.5 * math.tan(angle_rad))
     sine = min(max(times_wheelbase * math.sin(slip), -_LARGEST_SINE), _LARGEST_SINE)

@@ -1,6 +1,6 @@
 """`FollowedWorld`: a world whose time a master advances and whose agents followers drive.
 
-A cycle is that of Algorithm 1 of the co-simulation paper: the queued controls take effect, the
+The cycle is Algorithm 1 of the co-simulation paper: the queued controls take effect, the
 world ticks, sensors deliver the frame of t + Δt, each follower computes u from it, and u is queued
 for the next cycle. The cycle ends when every follower has answered. So a slow follower delays the
 world, and no frame is skipped.
@@ -176,7 +176,7 @@ class FollowedWorld:
             FollowerLostError: a follower has not answered in time, or has ended; it is dropped. The
                 world has advanced by one step, and the next call continues from there.
             FollowerError: a follower's messages are invalid, or its controls cannot be carried out;
-                the consequences are those of a FollowerLostError.
+                the consequences are as for a FollowerLostError.
             ActionError, CapacityError, ConfigError: the world refuses a body of a trace.
             ClockError: another caller has advanced the world.
         """
@@ -321,7 +321,7 @@ class FollowedWorld:
         """Send snapshots of the world and queue the followers' controls.
 
         Raises FollowerError: the error of the first follower, in their order, with which the world
-        cannot continue; the controls of the others are queued anyway.
+        cannot continue; the controls of the other followers are queued anyway.
         """
         if self._episode < 0 or not seats:
             return
@@ -334,7 +334,7 @@ class FollowedWorld:
     def _hear_others(self) -> None:
         """Receive messages of the followers for which the world does not wait.
 
-        Raises FollowerError: the messages of one of them are invalid.
+        Raises FollowerError: the messages of a follower are invalid.
         """
         others = [seat for seat in self._seats if not seat.waits]
         if others:
@@ -343,7 +343,7 @@ class FollowedWorld:
     def _await_leader(self) -> None:
         """Wait for the tick of the follower that leads.
 
-        Raises FollowerError: it does not tick in time, or its messages are invalid.
+        Raises FollowerError: the follower does not tick in time, or sends invalid messages.
         """
         if (leader := self.leader) is not None:
             self._settle(self._barrier.await_tick(leader, self._moment))
@@ -351,7 +351,7 @@ class FollowedWorld:
     def _confirm_tick(self) -> None:
         """Tell the follower that leads that its step has been made.
 
-        Raises FollowerLostError: it has ended.
+        Raises FollowerLostError: the follower has ended.
         """
         if (leader := self.leader) is not None:
             try:

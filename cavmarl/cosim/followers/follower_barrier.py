@@ -1,4 +1,4 @@
-"""`Barrier` sends every follower its snapshot and waits for the controls of all."""
+"""`Barrier` sends each follower a snapshot and waits for the controls of all followers."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ class FollowerSeat:
     waits: bool = True  # whether the world waits for its answers
     leads: bool = False  # whether its ticks release the steps of the world
     has_ticked: bool = False  # whether it has released the next step
-    frame: int = -1  # frame of the last snapshot sent to it; -1: none yet
+    frame: int = -1  # frame of the last snapshot sent to the follower; -1: none yet
     held: dict[str, Any] = field(default_factory=dict)  # last controls of its vehicles
     answers: int = 0  # number of controls sent in time
     late: int = 0  # number of answers to earlier snapshots, which are discarded
     bad: int = 0  # number of invalid controls of a vehicle
-    wait_wall_s: float = 0.0  # time that the world has waited for it, by the wall clock
+    wait_wall_s: float = 0.0  # time that the world has waited for the follower, wall clock
     slowest: int = 0  # number of steps in which it was the last to answer
-    unseen: int = 0  # number of snapshots not sent, because the follower has not read earlier ones
+    unseen: int = 0  # number of snapshots not sent, because earlier snapshots were unread
 
     @property
     def rank(self) -> tuple[float, str]:
@@ -73,7 +73,7 @@ class Barrier:
     """Sends snapshots and waits for the followers' answers.
 
     `timeout_s`: maximum time for all of them together, by the wall clock. `bad_controls`:
-    `error`: a follower that sends invalid controls fails; `hold`: the vehicle's last ones are used.
+    `error`: a follower that sends invalid controls fails; `hold`: the last valid controls are used.
     """
 
     def __init__(
@@ -168,7 +168,7 @@ class Barrier:
     def confirm_tick(self, seat: FollowerSeat) -> None:
         """Tell the follower that leads that its step has been made.
 
-        Raises FollowerLostError: it does not read, or has ended.
+        Raises FollowerLostError: the follower does not read, or has ended.
         """
         seat.has_ticked = False
         tick = int(seat.clock.master.world_ticks[0])
@@ -210,7 +210,7 @@ class Barrier:
     ) -> bool:
         """Receive one frame of a follower; return whether the follower is done.
 
-        Raises FollowerError: the world cannot continue with it.
+        Raises FollowerError: the world cannot continue with this follower.
         """
         # A frame that arrived just before the deadline is still read.
         within_s = max(within_s, 1e-3)
@@ -321,7 +321,7 @@ class Barrier:
 def _action(vehicle: str, controls: Mapping[str, Any]) -> Any:
     """Return one vehicle's action.
 
-    Raises FollowerError: it is missing.
+    Raises FollowerError: the action is missing.
     """
     if vehicle not in controls:
         raise FollowerError(f"no controls of {vehicle}, which is in the frame")

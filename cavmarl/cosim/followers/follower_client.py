@@ -61,8 +61,8 @@ class Follower:
     it listens at a port. `truth`: whether snapshots contain all vehicles of the world, which the
     world has to allow. `actors`: vehicles, people or roadside units to bring into the world; they
     leave with the follower. `waits`: whether the world waits for the answers; if not, the follower
-    may send poses and controls at any time, and misses snapshots while it has not read earlier
-    ones. `leads`: whether each step of the world waits for a `tick` of this follower.
+    may send poses and controls at any time, and misses snapshots while earlier snapshots are
+    unread. `leads`: whether each step of the world waits for a `tick` of this follower.
 
     Attributes:
         welcome: the world's clock and sensors.

@@ -132,8 +132,8 @@ class FollowerConnection:
     def hear(self, within_s: float | None = None) -> Frame:
         """Receive the next frame; then read its data with `take` or `skip`.
 
-        Raises FollowerLostError: none arrives in time, or the other end has ended; FollowerError:
-        the frame is invalid or of another version.
+        Raises FollowerLostError: no frame arrives in time, or the other end has ended;
+        FollowerError: the frame is invalid or of another version.
         """
         self._set_deadline(within_s)
         with self._peer_errors("answered", within_s):
@@ -378,7 +378,7 @@ class Reception:
         self._listener.close()
 
     def _open(self) -> None:
-        """Accept all present callers; if there are too many, the longest-waiting one is dropped."""
+        """Accept all waiting callers; if there are too many, drop the longest-waiting caller."""
         for _ in range(MAX_CALLERS):
             try:
                 connection, _ = self._listener.accept()

@@ -1,7 +1,7 @@
 """The messages between a world and its followers; docs/guides/cosimulation.md specifies them.
 
-A frame is that of `framed_socket`: a head, a payload in msgpack, and the bytes of arrays. A payload
-is data and never code. Each payload is one of these classes, as a map of its fields. A payload with
+A frame of `framed_socket` has a head, a payload in msgpack, and the bytes of arrays. A payload is
+data and never code: an instance of one of these classes, as a map of its fields. A payload with
 other fields, or with values of other types, is refused.
 """
 
@@ -74,8 +74,8 @@ class ActorRequest:
     x: StrictFloat  # centre, in m
     y: StrictFloat
     heading: StrictFloat  # rad, counter-clockwise from east
-    z: StrictFloat | None = None  # height of the ground below the centre, in m; none: of the lane
-    # body: length, width and height in m; empty: of the type
+    z: StrictFloat | None = None  # height of the ground below the centre, in m; none: the lane's
+    # body: length, width and height in m; empty: size of the type
     size_m: list[StrictFloat] = field(default_factory=list)
     speed: StrictFloat = 0.0  # at the start, in m/s
     moved_by: StrictStr = "poses"  # or `controls`, `nothing`
@@ -93,7 +93,7 @@ class Hello:
     name: StrictStr
     # agents to drive; none: it only follows the clock
     vehicles: list[StrictStr] = field(default_factory=list)
-    secret: StrictStr = ""  # of the world, if it listens at a port
+    secret: StrictStr = ""  # secret of the world, if the world listens at a port
     truth: StrictBool = False  # whether its snapshots are to contain all vehicles of the world
     actors: list[ActorRequest] = field(default_factory=list)  # actors that it brings
     # whether the world waits for its answers; if not, it sends poses and controls at any time
@@ -120,7 +120,7 @@ class Welcome:
     environment: StrictStr  # name and version
     map_hash: StrictStr  # hash of the roads' source; a stack needs the same map
     vehicles: list[StrictStr]  # agents assigned to the follower
-    tick: StrictInt  # the master's present tick
+    tick: StrictInt  # the master's current tick
     dt_s: StrictFloat
     ticks_per_step: StrictInt  # ticks from one snapshot to the next
     # ticks by which the vehicle delays controls after the start of their step
@@ -186,12 +186,12 @@ class FollowerSnapshot:
 
     frame: StrictInt  # consecutive number
     episode: StrictInt  # increases with each reset
-    tick: StrictInt  # of the world, since its reset
+    tick: StrictInt  # tick of the world, since its reset
     time_s: StrictFloat  # tick · dt_s, simulated time
     is_over: StrictBool  # whether the episode has ended; then no controls are due
     # the follower's vehicles in the world, which have to be driven
     vehicles: dict[StrictStr, VehicleView]
-    arrays: list[ArrayView]  # new samples of their sensors, and of those of the actors
+    arrays: list[ArrayView]  # new samples of the sensors of vehicles and actors
     actors: dict[StrictStr, ActorView] = field(default_factory=dict)  # actors by name
 
 
@@ -224,7 +224,7 @@ class Control:
 
     frame: StrictInt  # frame of the snapshot
     # by vehicle or actor. Vehicles: two numbers in [-1, 1], or the number of a meta-action. Actors
-    # that are moved by controls: two numbers in [-1, 1]; without new ones, the last ones are kept
+    # that are moved by controls: two numbers in [-1, 1]; the last controls are kept until new ones
     controls: dict[StrictStr, list[StrictFloat] | StrictInt]
     poses: dict[StrictStr, list[PoseView]] = field(default_factory=dict)  # as in `Poses`
 
@@ -236,7 +236,7 @@ class Ticked:
 
     done: StrictBool  # whether the world has advanced
     refused: StrictStr  # reason of a refusal; empty if not refused
-    tick: StrictInt  # present tick of the world, since its reset
+    tick: StrictInt  # current tick of the world, since its reset
 
 
 @with_config(_CLOSED)

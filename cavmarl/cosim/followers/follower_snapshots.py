@@ -27,7 +27,7 @@ from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.shown_signals import signal_codes
 from cavmarl.sensors.mounted.frames import SensorFrames
 
-# Columns of the array `truth`: those of `engine.world_frame.SEEN`, one row for each vehicle.
+# Columns of the array `truth`, as in `engine.world_frame.SEEN`; one row for each vehicle.
 TRUTH = (
     "id", "agent", "vclass", "x", "y", "z", "heading", "pitch", "speed", "accel", "steering",
     "length", "width", "height",
@@ -108,7 +108,7 @@ class SnapshotTime(NamedTuple):
 
     frame: int  # consecutive number
     episode: int  # increases with each reset
-    tick: int  # of the world, since its reset
+    tick: int  # tick of the world, since its reset
     is_over: bool  # whether the episode has ended
 
 

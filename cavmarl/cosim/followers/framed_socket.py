@@ -1,8 +1,8 @@
 """`FramedSocket`: frames over a connection.
 
-A frame is a head of fixed size, a payload (mostly a few numbers, encoded as the dialect defines)
-and data (bytes of arrays, whose shapes both ends know). A frame contains numbers and text, never
-code.
+A frame has three parts: a head of fixed size; a payload, mostly a few numbers, encoded as the
+dialect defines; and data, the bytes of arrays whose shapes both ends know. A frame contains numbers
+and text, never code.
 
     head    magic, version, kind, order, bytes of the payload, bytes of the data,
             checksum of the data, checksum of the head and the payload
@@ -92,7 +92,7 @@ class FramedSocket:
         Raises:
             EOFError: the other end has closed the connection.
             OSError: the connection is lost, or nothing arrives in time.
-            MessageError: the frame is damaged, or is not one of the dialect.
+            MessageError: the frame is damaged, or is not a frame of the dialect.
         """
         dialect = self._dialect
         raw = self._read(HEAD_BYTES)
@@ -106,7 +106,7 @@ class FramedSocket:
 
     def take(
         self,
-        arrays: Sequence[Array],  # contiguous; they are filled one after the other
+        arrays: Sequence[Array],  # contiguous arrays, filled one after the other
     ) -> None:
         """Read the data of the received frame into arrays.
 

@@ -58,7 +58,7 @@ _ELEMENTS: dict[int, list[Fields]] = {
     for code, shown in _SHOWN.items()
 }
 
-_LABELS = {"truck": 2, "bus": 3, "tram": 3, "motorcycle": 5, "bicycle": 6}  # all others are cars: 1
+_LABELS = {"truck": 2, "bus": 3, "tram": 3, "motorcycle": 5, "bicycle": 6}  # other types: 1 (car)
 _HAS_DIRECTION = 2  # DetectedObjectKinematics: front and rear are known
 
 

@@ -35,7 +35,7 @@ class BridgedWorld:
         report: figures of the bridge, after the `with` statement.
 
     Raises:
-        CavmarlError: the error of the bridge if it has failed, otherwise that of the world.
+        CavmarlError: the error of the bridge if it has failed, otherwise the error of the world.
     """
 
     def __init__(

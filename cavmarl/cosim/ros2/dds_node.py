@@ -1,6 +1,6 @@
 """`DdsNode`: a ROS 2 node on DDS, by Cyclone DDS and without ROS.
 
-Names, qualities of service and encodings are those of ROS's middleware (rmw_cyclonedds_cpp and
+Names, qualities of service and encodings are as in ROS's middleware (rmw_cyclonedds_cpp and
 rmw_fastrtps_cpp); docs/reference/ros2.md lists them.
 """
 
@@ -257,7 +257,7 @@ class DdsNode:
         fields = {field: described(node) for field, node in self._types.fields_of(kind)}
         cls = idl.make_idl_struct(f"{name}_", _dds_name(kind), fields)
 
-        # The signatures are those of Cyclone DDS's own methods.
+        # The signatures equal the signatures of Cyclone DDS's own methods.
         def serialize(
             self: Any, buffer: Any = None, endianness: Any = None, use_version_2: Any = None
         ) -> bytes:

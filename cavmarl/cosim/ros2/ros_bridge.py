@@ -84,7 +84,7 @@ class RosBridge:
     """A follower of a world as a ROS 2 node.
 
     Args:
-        follower: the connection to the world; its `truth` must be that of `options`.
+        follower: the connection to the world, with the same `truth` as `options`.
         options: settings of the bridge.
 
     Attributes:
@@ -263,7 +263,7 @@ class RosBridge:
                     kind,
                     self._node.kind_of(topic),
                 )
-        # This node subscribes to the clock itself. Late subscribers get latched topics, too.
+        # This node subscribes to the clock itself. Late subscribers also get latched topics.
         self._wanted = frozenset(
             topic
             for topic in self._topics.kinds

@@ -77,7 +77,7 @@ class ControlCounts:
     received: int = 0  # messages
     used: int = 0  # steps with a command for their time
     held: int = 0  # steps with an older command, or without any (the vehicle brakes)
-    late: int = 0  # steps in which no command came before the deadline
+    late: int = 0  # steps in which no command arrived before the deadline
     old: int = 0  # messages older than a used message
     invalid: int = 0  # messages with NaN, infinity, or bytes that are not a message
     limited: int = 0  # steps in which a command was beyond the limits of the vehicle

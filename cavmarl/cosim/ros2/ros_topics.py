@@ -85,7 +85,7 @@ class RosClock:
         self.now_ns = self._begin_ns + tick * self._dt_ns
 
     def ns_of(self, stamp_s: float) -> int:
-        """Return the time of a sample of the present episode."""
+        """Return the time of a sample of the current episode."""
         return self._begin_ns + round(1e9 * stamp_s)
 
 
@@ -138,12 +138,12 @@ class VehicleTopics:
     Attributes:
         base: name of the frame `base_link`.
         kinds: type of each topic.
-        latched: topics whose last message is for late subscribers, too.
+        latched: topics whose last message late subscribers also get.
         motion: its motion as far as it is known without the true state.
 
     Raises:
-        ConfigError: `names` has a sensor that the vehicle does not have, or two sensors have one
-            topic.
+        ConfigError: `names` has a sensor that the vehicle does not have, or two sensors have the
+            same topic.
     """
 
     def __init__(
@@ -326,7 +326,7 @@ class WorldTopics:
 
     Attributes:
         kinds: type of each topic.
-        latched: topics whose last message is for late subscribers, too.
+        latched: topics whose last message late subscribers also get.
     """
 
     def __init__(self, vehicles: Sequence[VehicleTopics], clock: RosClock, truth: bool) -> None:
@@ -340,12 +340,12 @@ class WorldTopics:
                     "vehicle with the profile autoware, and other names of sensors"
                 )
             self.kinds |= vehicle.kinds
-        self._mounted: dict[str, float] = {}  # vehicle → wheelbase of its present transforms
+        self._mounted: dict[str, float] = {}  # vehicle → wheelbase of its current transforms
         self._begun: dict[str, tuple[int, VehicleView]] = {}  # vehicle → episode, its description
         self._rows = np.zeros((0, len(TRUTH)))
 
     def clock_message(self) -> RosMessage:
-        """Return the message of the present time."""
+        """Return the message of the current time."""
         now_ns = self.clock.now_ns
         return RosMessage(CLOCK, self.kinds[CLOCK], now_ns, {"clock": time_of(now_ns)})
 
@@ -404,7 +404,7 @@ class WorldTopics:
         return self._begun | found
 
     def _mounts(self, view: FollowerView) -> list[Fields]:
-        """Return the transforms of all vehicles' sensors, if those of a vehicle have changed."""
+        """Return the transforms of all vehicles' sensors, if any transform has changed."""
         present = view.snapshot.vehicles.items()
         known = self._mounted | {name: seen.wheelbase_m for name, seen in present}
         if known == self._mounted:

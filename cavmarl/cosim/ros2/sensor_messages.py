@@ -33,7 +33,7 @@ POINT = np.dtype(
     ]
 )
 TARGET = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("radial_speed", "<f4")])
-_DATATYPES = {"u1": 2, "u2": 4, "f4": 7}  # of `sensor_msgs/msg/PointField`
+_DATATYPES = {"u1": 2, "u2": 4, "f4": 7}  # codes of `sensor_msgs/msg/PointField`
 _OPTICAL = {"x": -0.5, "y": 0.5, "z": -0.5, "w": 0.5}  # z forward, x right, y down
 
 
@@ -51,7 +51,7 @@ Make = Callable[[Settings, NDArray[Any], int, str], list[Made]]
 
 def quaternion_of(turn: NDArray[np.float64]) -> Fields:
     """Return the `geometry_msgs/msg/Quaternion` of a rotation matrix (3, 3)."""
-    # The largest of the four components is computed first; the others follow by division.
+    # The largest of the four components is computed first; the other components follow by division.
     squares = np.array(
         [
             1.0 + turn[0, 0] - turn[1, 1] - turn[2, 2],
@@ -106,7 +106,7 @@ def transform(stamp_ns: int, parent: str, child: str, place: Any, turn: Fields) 
 def mount_transforms(
     settings: Settings, stamp_ns: int, base: str, frame: str, wheelbase_m: float
 ) -> list[Fields]:
-    """Return the transform of a sensor, and that of a camera's optical frame."""
+    """Return the transform of a sensor, and the transform of a camera's optical frame."""
     angles = (math.radians(settings[key]) for key in ("yaw_deg", "pitch_deg", "roll_deg"))
     place = settings["x_m"] + 0.5 * wheelbase_m, settings["y_m"], settings["z_m"]
     found = [transform(stamp_ns, base, frame, place, quaternion_of(turn_of(*angles)))]

@@ -23,7 +23,7 @@ from cavmarl.sensors.kernels.panorama import SEMANTIC_NAMES
 from cavmarl.sensors.mounted.mount_transforms import mount_rotation
 
 _HEIGHTS_M = (0.3, 0.7, 1.1)  # heights above the ground
-_NEAREST_M = 0.5  # minimum depth before the camera
+_NEAREST_M = 0.5  # minimum depth in front of the camera
 _BEHIND_M = 2.0  # echoes this much deeper than the nearest one in their column may be hidden
 _KINDS = {
     "building": "building",
@@ -134,7 +134,7 @@ def _pixels(
 ) -> NDArray[np.uint8]:
     """Return the classes of the pixels that points (n, 3) of the vehicle's frame project to.
 
-    `covered_m`: by column, the depth beyond which a point may be hidden behind another one.
+    `covered_m`: by column, the depth beyond which a point may be hidden behind another point.
     """
     ahead_m, column, row = _projected(camera, points)
     height, width = picture.shape

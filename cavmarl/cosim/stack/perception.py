@@ -57,7 +57,7 @@ class LidarObjects:
         self._last: list[Obstacle] = []
 
     def perceive(self, readings: Readings, pose: EgoPose, time_s: float) -> list[Obstacle]:
-        """Return objects on the road; without a new scan, those of the last scan."""
+        """Return objects on the road; without a new scan, the objects of the last scan."""
         echoes = []
         for lidar in self._lidars:
             samples = readings.get(lidar.name)
@@ -163,7 +163,7 @@ def _groups(
     level = 0
     if layers > 1:
         rising = elevations(settings["lower_deg"], settings["upper_deg"], layers)
-        level = int(np.argmin(np.abs(rising).round(9)))  # of two equal layers, the lower one
+        level = int(np.argmin(np.abs(rising).round(9)))  # the lower of equal layers
     all_around = settings["fov_deg"] == 360.0
     first, step, rays = azimuths(settings["fov_deg"], scan.shape[1])
     turns = first + step * np.arange(rays) + lidar.mount.yaw_rad

@@ -1,6 +1,6 @@
 """Planning on the lane graph: the route to the goal, and the acceleration along it.
 
-The route is that of `roads.routing.make_plans`, without traffic. The acceleration is the minimum of
+The route comes from `roads.routing.make_plans`, without traffic. The acceleration is the minimum of
 the Intelligent Driver Model (Treiber, Hennecke, Helbing, 2000) over all obstacles on the route. A
 line where a signal or a vehicle with the right of way requires a stop counts as a stopped obstacle.
 """
@@ -101,7 +101,7 @@ class LaneRoute:
     def _change_lane(
         self, here: OnLane, pose: EgoPose, plan: NDArray[np.void], obstacles: Sequence[Obstacle]
     ) -> OnLane:
-        """Return the lane beside the present one if the route needs it and there is room."""
+        """Return the lane beside the current one if the route needs it and there is room."""
         change = int(plan["change"][here.lane])
         row = self._network.lanes[here.lane]
         if change == 0 or row["internal"]:

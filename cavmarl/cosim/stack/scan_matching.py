@@ -108,7 +108,7 @@ class ScanMatching(GnssInertial):
         return self._pose()
 
     def _forget(self) -> None:
-        """Reset the position's uncertainty to that of a fix."""
+        """Reset the position's uncertainty to the uncertainty of a fix."""
         state = self._get()
         place = (state[:2] + self.bias).tolist()
         self._set_by_fix((*place, float(state[2]), float(state[3])), (1.0, 1.0, 0.1, 1.0))
@@ -142,7 +142,7 @@ class ScanMatching(GnssInertial):
         return float(off @ np.linalg.solve(spread, off))
 
     def _starts(self, target: Target, echoes: Points, begin: Points) -> list[Points]:
-        """Return start motions (4, 4) for matching: the possible ones with the best fit."""
+        """Return start motions (4, 4) for matching: the possible motions with the best fit."""
         deviation_m = math.sqrt(float(np.linalg.eigvalsh(self._spread[:2, :2])[-1]))
         self._next_try -= 1
         if deviation_m < _SURE_M or self._next_try > 0:
@@ -238,7 +238,7 @@ class _Fit(NamedTuple):
     motion: Points  # (4, 4) from the vehicle's frame to the map's
     placed: Points  # (n, 3) echoes on the map
     rows: NDArray[np.int64]  # nearest wall point of each echo
-    distance_m: Points  # (n,) distance to it
+    distance_m: Points  # (n,) distance to the nearest wall point
 
     def shifted(self, target: Target, by_m: Points) -> _Fit:
         """Return the scan shifted by (2,) in the plane."""
@@ -274,7 +274,7 @@ def _likelihood(distance_m: Points) -> float:
 def _slides(target: Target, fit: _Fit, axis: Points) -> bool:
     """Return whether a scan fits about as well when shifted along an axis (2,) of the plane.
 
-    Normals alone are not sufficient: those of a rough wall also point along the wall.
+    Normals alone are not sufficient: normals of a rough wall also point along the wall.
     """
     sides = [fit.shifted(target, way * axis).likelihood for way in (-_ASIDE_M, _ASIDE_M)]
     return fit.likelihood - max(sides) < _WORSE

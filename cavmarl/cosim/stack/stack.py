@@ -4,7 +4,7 @@ Control uses pure pursuit for the steering, and limits of the vehicle class for 
 Coulter: "Implementation of the pure pursuit path tracking algorithm", CMU-RI-TR-92-01, 1992: the
 circle through the vehicle's centre, tangent to its motion, that meets a point of the path ahead has
 the curvature 2 sin(alpha) / distance. The kinematic bicycle turns with that curvature at the slip
-angle asin(curvature · L / 2), whose tangent is half that of the steering angle.
+angle asin(curvature · L / 2), whose tangent is half the tangent of the steering angle.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ R = TypeVar("R")
 class Gains(NamedTuple):
     """The control parameters of a vehicle class."""
 
-    lookahead_s: float  # lookahead of the steering, as time at the present speed
+    lookahead_s: float  # lookahead of the steering, as time at the current speed
     least_lookahead_m: float  # minimum lookahead
     accel_mps2: float  # maximum acceleration
     brake_mps2: float  # maximum braking, positive
@@ -62,7 +62,7 @@ class Gains(NamedTuple):
 _CAR = Gains(0.5, 3.5, 2.5, 6.0, 1.2)
 _HEAVY = Gains(0.7, 6.0, 1.2, 5.0, 0.6)
 
-# By SUMO's class; other classes use those of cars.
+# By SUMO's class; other classes use the parameters of cars.
 GAINS = {"passenger": _CAR, "truck": _HEAVY, "bus": _HEAVY}
 
 

@@ -105,7 +105,7 @@ class Localisation(Protocol):
     """Estimates the vehicle's pose by sensors."""
 
     def locate(self, readings: Readings, mission: Mission, time_s: float) -> EgoPose | None:
-        """Return the present pose; None: unknown."""
+        """Return the current pose; None: unknown."""
         ...
 
     def reset_pose(self, pose: EgoPose) -> None: ...
@@ -129,7 +129,7 @@ class Planning(Protocol):
         signals: NDArray[np.uint8] | None,
         mission: Mission,
     ) -> Trajectory:
-        """Return the route from the present pose.
+        """Return the route from the current pose.
 
         `obstacles`: objects on the road. `signals`: (num_links,) SIGNAL_* codes, 255: no signal;
         None: unknown. `mission`: the destination.

@@ -52,7 +52,7 @@ class Coordinator(ABC):
         self._watchers: tuple[Watcher, ...] = ()
         self._births: list[Birth] = []
         self._gone: list[Removed] = []  # vehicles that left between two ticks
-        self._removed: list[Removed] = []  # vehicles that left in the present tick
+        self._removed: list[Removed] = []  # vehicles that left in the current tick
 
     @property
     def directory(self) -> Directory:

@@ -98,7 +98,7 @@ class WorldCoordinators(OwnershipRuntime):
         saved = self.coordinators[w].save()
         if saved is None or not self._rows_changed[w]:
             return saved
-        # Rows have changed since vehicles near borders were recorded, so they are searched again.
+        # Rows have changed since vehicles near borders were recorded, so they must be found again.
         numbers = saved.numbers._replace(is_stirred=1, crossed=0)
         return saved._replace(numbers=numbers, near=saved.near[:0])
 

@@ -62,7 +62,7 @@ class HandoffLog:
         self,
         check_all: bool,  # check all rows, because rows have changed since ghosts were renewed
         vehicles: int,  # expected number of vehicles
-        newborn: Sequence[Birth],  # vehicles that entered since the last BEGIN, which stay
+        newborn: Sequence[Birth],  # vehicles that entered since the last BEGIN keep their owner
     ) -> int:  # number of changes
         """Change the owners of vehicles that have crossed a border, according to committed rows.
 
@@ -146,7 +146,7 @@ class HandoffLog:
         return [OwnerChange(*change) for change in found.tolist()]
 
     def take(self, but: int = 0) -> NDArray[np.void]:
-        """Return and remove all changes CHANGE (n,), except the `but` newest ones."""
+        """Return and remove all changes CHANGE (n,), except the `but` newest changes."""
         last = len(self)
         changes = self._book.changes[self._world]
         taken: NDArray[np.void] = changes[: last - but].copy()
@@ -186,7 +186,7 @@ class HandoffLog:
         )
 
     def go_on(self, saved: SavedBorders) -> None:
-        """Resume from a state that `save` returned. Clocks start now."""
+        """Resume from a state that `save` returned. Durations count from this call."""
         book, w = self._book, self._world
         now = book.turn.item(w)
         self.reset(saved.tick)

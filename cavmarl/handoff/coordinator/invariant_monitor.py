@@ -44,7 +44,7 @@ class Departed(NamedTuple):
     """A vehicle that has left the world since the last tick."""
 
     vehicle: int
-    zone: int  # its last owner
+    zone: int  # the vehicle's last owner
     epoch: int
 
 
@@ -86,7 +86,7 @@ class OwnersOnRecord:
         return self._checker.owners
 
     def logged(self, records: Iterable[Record]) -> None:
-        """Receive records. Raises ProtocolError if a correct run does not make such a record."""
+        """Receive records. Raises ProtocolError if a record cannot come from a correct run."""
         for record in records:
             self._take(record)
             if isinstance(record, Reset):
@@ -158,7 +158,7 @@ class InvariantMonitor:
         _, count, num_worlds, capacity = division.zoned.rows.shape
         self._ticks = [0] * num_worlds
         self._vehicles: list[set[int]] = [set() for _ in range(num_worlds)]
-        # The results of the last check and of the one before it.
+        # The results of the last check and of the previous check.
         self._kept = [
             (make_kept(count, capacity), make_kept(count, capacity)) for _ in range(num_worlds)
         ]

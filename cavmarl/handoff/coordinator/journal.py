@@ -175,7 +175,7 @@ class Journal:
         A process may continue the file of another process that has stopped writing.
 
         Raises:
-            JournalError: the journal has no such earlier end.
+            JournalError: the journal has no line that ends there.
         """
         chain = place.chain()
         try:
@@ -236,7 +236,7 @@ class Journal:
 
     def _lock(self) -> None:
         """Lock the file against other writers while it is open."""
-        if sys.platform == "win32":  # has no fcntl
+        if sys.platform == "win32":  # Windows has no fcntl
             return
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)

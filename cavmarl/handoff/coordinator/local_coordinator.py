@@ -1,8 +1,8 @@
 """`LocalCoordinator`: the coordinator of a world whose zones are all in one process.
 
 In one process no message is lost, no zone is late, and no process dies alone. So no messages are
-needed: a vehicle that has crossed a border is offered, acknowledged and handed over in one call,
-the new owner copies the old owner's row, and the call that advances a shard replaces the lease. The
+needed: a vehicle that has crossed a border is offered, acknowledged and handed over in one call.
+The new owner copies the old owner's row. The call that advances a shard replaces the lease. The
 decisions and the records are the same as with messages if no message is lost.
 
 The table of owners is updated from time to time, and on request. Records are made only if they are
@@ -67,7 +67,7 @@ class LocalCoordinator(Coordinator):
         self._is_open = False
         self._tick = 0
         self._vehicles = 0
-        self._changed = 0  # number of changes in the present tick
+        self._changed = 0  # number of changes in the current tick
         self._late = 0  # number of changes that are missing in the table
         self._new: tuple[Birth, ...] = ()
         self._news: dict[int, _News] = {}  # tick → entries that are missing in the table
@@ -219,7 +219,7 @@ class LocalCoordinator(Coordinator):
             self.foretell(self._book.newest(changed))
 
     def catch_up(self) -> None:
-        """Update the table and the log of transfers up to the present tick."""
+        """Update the table and the log of transfers up to the current tick."""
         table = self._directory.table
         if table.tick == self._tick:
             return

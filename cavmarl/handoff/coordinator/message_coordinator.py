@@ -1,9 +1,9 @@
 """`MessageCoordinator`: the coordinator of a world in which other simulators run some zones.
 
 All zones are in this process, but another simulator can refuse a vehicle, be late or die. So each
-zone has an endpoint of the ownership protocol, and all messages are sent: a vehicle that has
-crossed a border is offered with its state (PREPARE), its new zone accepts or refuses it (ACK,
-NACK), the coordinator decides (BEGIN, STEP), and both zones confirm and release it (DONE, COMMIT).
+zone has an endpoint of the ownership protocol, and all messages are sent. A vehicle that has
+crossed a border is offered with its state (PREPARE). Its new zone accepts or refuses it (ACK,
+NACK). The coordinator decides (BEGIN, STEP). Both zones confirm and release it (DONE, COMMIT).
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ class MessageCoordinator(Coordinator):
             self._endpoints[zone] = Endpoint(directory.hosting(zone), self._limits)
 
     def _worker_of(self, zone: int) -> int:
-        """Return the worker of a zone in the records: 0 is cavmarl, 1 + zone its simulator."""
+        """Return the worker of a zone in the records: 0 for cavmarl, 1 + zone for a simulator."""
         return 1 + zone if zone in self._gate.zones and zone not in self._returned else 0
 
     def save(self) -> None:

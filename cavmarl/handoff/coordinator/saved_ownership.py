@@ -140,7 +140,7 @@ class SavedOwnership(NamedTuple):
         if max(map(len, (near, self.coming, self.before))) > 2 * capacity:
             raise _damaged("more vehicles are near borders than a world can hold")
         if abs(numbers.owned - len(vehicles)) > len(births) + len(gone):
-            raise _damaged(f"it is of {numbers.owned} vehicles, not of {len(vehicles)}")
+            raise _damaged(f"it describes {numbers.owned} vehicles, not {len(vehicles)}")
         if numbers.episode < -1 or min(numbers[1:-1]) < 0 or numbers.is_stirred > 1:
             raise _damaged(f"{numbers} has a number outside of its range")
         of_zones = (

@@ -187,7 +187,7 @@ def watch(
     clock: CheckTime,
     masks: NDArray[np.uint64],  # (n,) the bits that a ghost shares with its owner's row
     factors: NDArray[np.uint64],  # (n,) odd random numbers
-    before: Kept,  # from the last check
+    before: Kept,  # data of the last check
     now: Kept,  # output, for the next check
     strays: Strays,  # scratch; its `entered` and `left` are outputs
     live: int,  # expected number of vehicles
@@ -258,7 +258,7 @@ def _match(
     moved: int,
     finding: np.void,
 ) -> None:
-    """Search vehicles that are new in their row among the vehicles missing from theirs."""
+    """Search vehicles that are new in their row among the vehicles missing from their row."""
     table = strays.table
     entered = 0
     for n in range(moved):

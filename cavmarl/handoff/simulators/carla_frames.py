@@ -75,7 +75,7 @@ def check_option(options: Mapping[str, str]) -> None:
 
 
 def check_rig(zone: int, options: Mapping[str, str], rig: Mapping[str, MountedConfig]) -> None:
-    """If the samples of a rig are to come from CARLA, check that its sensors can take them.
+    """Check that CARLA's sensors can take the samples of a rig, if they are to take them.
 
     Raises:
         ConfigError: the rig has a sensor of the surroundings without frames of CARLA, a
@@ -188,7 +188,7 @@ def _distances(config: LidarRigConfig, points: NDArray[np.float32]) -> NDArray[n
     distance = np.sqrt(ahead * ahead + right * right + up * up)
     first, step, rays = azimuths(config.fov_deg, config.rays)
     half = 0.5 * (rays - 1)
-    aside = np.arctan2(-right, ahead) - (first + step * half)  # from the middle of all rays
+    aside = np.arctan2(-right, ahead) - (first + step * half)  # angle from the middle of all rays
     beside = np.arctan2(np.sin(aside), np.cos(aside)) / step + half
     column = np.rint(beside).astype(np.int64)
     off = np.abs(beside - column)

@@ -86,7 +86,7 @@ class CarlaZone:
             raise self._failure(f"{python} cannot be started ({error.strerror})") from error
         self.pid = self._process.pid
         self._rest = b""
-        self._unread = 0  # number of answers still to come; more than one after an interrupt
+        self._unread = 0  # number of outstanding answers; more than one after an interrupt
         try:
             self._call(
                 "start",
@@ -192,16 +192,16 @@ class CarlaZone:
             answer: dict[str, Any] = dict(json.loads(line))
         except ValueError as error:
             self._process.kill()
-            raise self._failure(f"its client has sent {line[:80]!r}, which is no answer") from error
+            raise self._failure(f"its client has sent {line[:80]!r}, not an answer") from error
         if "error" in answer:
             advice = ""
             if "No module named 'carla'" in answer["error"]:
-                advice = f"; install the package carla, or let {PYTHON} name a Python that has it"
+                advice = f"; install the package carla, or set {PYTHON} to a Python that has it"
             raise self._failure(f"{kind}: {answer['error']}{advice}")
         return answer["result"]
 
     def _line(self, until_s: float) -> bytes:
-        """Wait for all answers still to come; return the last answer."""
+        """Wait for all outstanding answers; return the last answer."""
         line = b""
         while self._unread:
             line = self._next_line(until_s)

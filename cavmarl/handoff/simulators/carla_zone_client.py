@@ -142,7 +142,7 @@ class Zone:
         id_of = _signal_ids(self._map.to_opendrive())
         self._lights = {name: lights[one] for name, one in id_of.items() if one in lights}
         self._shown: dict[str, str] = {}
-        self._world.freeze_all_traffic_lights(True)  # their own programs do not run
+        self._world.freeze_all_traffic_lights(True)  # stop the signals' own programs
         library = self._world.get_blueprint_library().filter("vehicle.*")
         self._blueprints = sorted(library, key=lambda one: str(one.id))
 
@@ -163,8 +163,8 @@ class Zone:
         )
         if on_road < SEEN_LANES * len(places):
             raise ValueError(
-                f"its map {self._map.name} is another one: {len(places) - on_road} of "
-                f"{len(places)} places on lanes are beside its roads; load the map of this world "
+                f"its map {self._map.name} is wrong: {len(places) - on_road} of "
+                f"{len(places)} places on lanes are off its roads; load the map of this world "
                 "(cavmarl map export NAME --carla --opendrive FILE)"
             )
 
@@ -202,7 +202,7 @@ class Zone:
             car.sensors[name] = MountedActor(actor)
 
     def sense(self, sensor: str, vehicles: Sequence[int]) -> dict[int, str]:
-        """Return the last tick's frame in base64 for each vehicle that has one."""
+        """Return the last tick's frame of each vehicle in base64, if the vehicle has a frame."""
         found = {}
         for vehicle in vehicles:
             data = self._cars[vehicle].sensors[sensor].data(self._frame, self._timeout_s)
@@ -232,7 +232,7 @@ class Zone:
         return (fitting or self._blueprints)[0]
 
     def drop(self, vehicles: Sequence[int]) -> None:
-        """Give up vehicles. Vehicles that remain visible become ghosts in `show`."""
+        """Release vehicles. Vehicles that remain visible become ghosts in `show`."""
         for vehicle in vehicles:
             car = self._cars[vehicle]
             car.is_owned = False

@@ -22,7 +22,7 @@ class SimulatorKind(NamedTuple):
     Attributes:
         make: makes the simulator of one zone of one world.
         tolerance_m: largest distance between the place that the simulator reports and the place
-            where cavmarl would have moved the vehicle in the same tick; 0: both are equal.
+            where cavmarl would have moved the vehicle in the same tick; 0: the places are equal.
     """
 
     make: MakeSimulator

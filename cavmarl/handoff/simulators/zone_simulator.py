@@ -110,7 +110,7 @@ class FrameSource(Protocol):
     frame_types: frozenset[str]
 
     def sense(self, sensor: str, vehicles: Sequence[int]) -> Mapping[int, NDArray[Any]]:
-        """Return the samples of the present tick.
+        """Return the samples of the current tick.
 
         Args:
             sensor: name of the sensor in the rig.

@@ -38,7 +38,7 @@ _libc.madvise.argtypes = (ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int)
 
 
 def huge_shared_zeros(shape: int | tuple[int, ...], dtype: DTypeLike = np.float64) -> NDArray[Any]:
-    """Return zeros like `shared_zeros`; large arrays use huge pages if the system has free ones.
+    """Return zeros like `shared_zeros`; large arrays use huge pages if the system has any.
 
     An array of more than `MOST_BYTES` has small pages, each allocated when it is first written.
 
@@ -59,10 +59,10 @@ def huge_shared_zeros(shape: int | tuple[int, ...], dtype: DTypeLike = np.float6
 
 
 def collapse_heap() -> None:
-    """Merge the heap of this process into huge pages if the system has free ones.
+    """Merge the heap of this process into huge pages if the system has free huge pages.
 
     Forked processes then share fewer pages. The system reports the death of a process only after it
-    has released all pages of the process, so fewer pages mean that deaths are noticed sooner.
+    has released all pages of the process. With fewer pages, deaths are noticed sooner.
     """
     with open("/proc/self/maps", encoding="utf-8") as maps:
         heaps = [line.split()[0] for line in maps if line.rstrip().endswith("[heap]")]

@@ -69,7 +69,7 @@ class Segment:
             self.size = size
 
     def map(self) -> mmap.mmap:
-        """Map the segment at its present size, which another process may have changed."""
+        """Map the segment at its current size, which another process may have changed."""
         self.size = os.fstat(self.fd).st_size
         try:
             return mmap.mmap(self.fd, self.size)

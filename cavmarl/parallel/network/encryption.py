@@ -27,7 +27,7 @@ class EncryptedSocket(ssl.SSLSocket):
     """A TLS socket that raises `BlockingIOError` like a plain non-blocking socket."""
 
     def sendmsg(self, buffers: Iterable[Any], *_: Any) -> int:  # type: ignore[override]
-        """Send bytes and return their number; the next call must pass the rest unchanged."""
+        """Send some of the bytes; return their number. The next call must begin with the rest."""
         pieces, size = [], 0
         for piece in buffers:
             pieces.append(piece)
@@ -95,7 +95,7 @@ def _context(secret: bytes, calls: bool) -> ssl.SSLContext:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT if calls else ssl.PROTOCOL_TLS_SERVER)
     context.sslsocket_class = EncryptedSocket
     context.minimum_version = ssl.TLSVersion.TLSv1_3
-    context.check_hostname = False  # any machine may hold the key
+    context.check_hostname = False  # the certificate is valid on any machine
     context.verify_mode = ssl.CERT_REQUIRED
     context.load_verify_locations(cadata=certificate.decode())
     if not calls:

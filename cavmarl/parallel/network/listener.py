@@ -33,7 +33,7 @@ from cavmarl.parallel.network.encryption import (
 )
 
 MAGIC = b"cavW"
-VERSION = 1  # of this handshake
+VERSION = 1  # version of this handshake
 NONCE = 16  # bytes of a random number
 PROOF = 32  # bytes of an HMAC
 SECRET = 32  # bytes
@@ -47,12 +47,12 @@ HELLO = struct.Struct(f"<4sHI{NONCE}s")
 
 
 class PendingConnection:
-    """A caller that has not proved yet that it knows the secret."""
+    """A caller that has not yet proved that it knows the secret."""
 
     def __init__(self, connection: socket.socket, secret: bytes) -> None:
         connection.setblocking(False)
         self.until_s = time.monotonic() + HANDSHAKE_S  # deadline, by `time.monotonic`
-        self.number = -1  # number that the caller claims to have; -1: HELLO has not come
+        self.number = -1  # number that the caller claims to have; -1: no HELLO received yet
         self._socket = connection
         if leaves_this_machine(connection):
             self._socket = encrypted(connection, secret, calls=False)
@@ -67,7 +67,7 @@ class PendingConnection:
         """Read received bytes; return the connection once the caller has proved the secret.
 
         Raises:
-            OSError: the caller has gone.
+            OSError: the caller has disconnected.
             EOFError: the caller has ended the connection.
             MessageError: the caller has another protocol or version, or does not know the secret.
         """
@@ -119,7 +119,7 @@ class PendingConnection:
 
 
 class Listener:
-    """Admits callers that know the secret; strangers cost little and are disconnected.
+    """Admits callers that know the secret; other callers cost little and are disconnected.
 
     Raises:
         WorkerError: the process cannot listen on the port.
@@ -129,7 +129,7 @@ class Listener:
     def __init__(
         self,
         address: str,
-        secret: bytes | None = None,  # known to the callers; None: a random one
+        secret: bytes | None = None,  # known to the callers; None: a random secret
         port: int = 0,  # 0: the system chooses
     ) -> None:
         self.secret = secrets.token_bytes(SECRET) if secret is None else secret
@@ -189,7 +189,7 @@ class Listener:
                 self._disconnect_the_first()
             try:
                 caller = PendingConnection(connection, self.secret)
-            except OSError:  # the caller has gone
+            except OSError:  # the caller has disconnected
                 connection.close()
                 continue
             self._callers.append(caller)
@@ -199,7 +199,7 @@ class Listener:
     def _listen(self, caller: PendingConnection, admitted: list[tuple[int, socket.socket]]) -> None:
         try:
             connection = caller.listen()
-        except (EOFError, OSError, MessageError):  # not a node of this run: ignored
+        except (EOFError, OSError, MessageError):  # not a node of this run
             self._disconnect(caller)
             return
         if connection is not None:
@@ -224,7 +224,7 @@ class Listener:
             time.sleep(NO_DESCRIPTORS_S)
 
     def _disconnect_the_first(self) -> None:
-        """Disconnect the oldest caller without a HELLO; if all have sent one, the oldest caller."""
+        """Disconnect the oldest caller, preferably a caller that has sent no HELLO."""
         self._disconnect(min(self._callers, key=lambda each: (each.number >= 0, each.until_s)))
 
     def _disconnect(self, caller: PendingConnection) -> None:
@@ -291,7 +291,7 @@ def _prove(connection: socket.socket, place: tuple[str, int], secret: bytes, num
             (version,) = _VERSION.unpack(received)[1:]
             raise MessageError(
                 f"the process at {place[0]}:{place[1]} has version {version} of the handshake, "
-                f"this one has {VERSION}: install the same cavmarl on all machines"
+                f"this process has {VERSION}: install the same cavmarl on all machines"
             )
         if not more:
             raise EOFError(f"the process at {place} has ended the connection")

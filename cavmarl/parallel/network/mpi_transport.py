@@ -36,7 +36,7 @@ MPI: Literal["mpi"] = "mpi"
 CALLER = 0  # the rank of the program whose worlds the other ranks host
 NOTICE = 0  # tag of notices
 LISTENER = 0  # number by which a poll reports the listener
-LOOKS = 500  # polls without a nap; after that, the process naps between polls
+LOOKS = 500  # number of polls before the process sleeps between polls
 NAP_S = 50e-6
 END_S = 60.0  # time for the other ranks to end after the caller
 PRINTED_S = 0.3  # time for printed text to arrive before the run is aborted
@@ -55,7 +55,7 @@ class _Notice(IntEnum):
     OPEN = 0  # number of the caller, for the listener; number of the caller's end
     ACCEPT = 1  # number of the listener's end; number of the caller's end
     CLOSE = 2  # unused; number of the receiver's end
-    GONE = 3  # both unused; the process of the sender ends
+    GONE = 3  # two unused numbers; the process of the sender ends
 
 
 class MpiConnection:
@@ -272,7 +272,7 @@ class MpiTransport:
                 end.close()
         elif what == _Notice.ACCEPT and end is not None:
             end.far = first
-        elif what == _Notice.ACCEPT:  # `open` has given up
+        elif what == _Notice.ACCEPT:  # `open` no longer waits
             self._send_notice(rank, _Notice.CLOSE, 0, first)
         elif what == _Notice.CLOSE and end is not None:
             end.has_ended = True

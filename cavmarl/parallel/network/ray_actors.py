@@ -9,8 +9,8 @@ from typing import Any
 from cavmarl.core.errors import WorkerError, require
 from cavmarl.parallel.network.ray_cluster import choose_nodes, join, leave, nodes_with
 
-END_S = 3.0  # time for actors to return: Ray prints a complaint for each that is killed
-SPARES = 1  # actors that wait to replace a dead one: a new actor takes seconds
+END_S = 3.0  # time for actors to return: Ray prints an error for each killed actor
+SPARES = 1  # spare actors, which replace dead actors at once; starting an actor takes seconds
 
 Main = Callable[[tuple[str, int], bytes, int], None]
 
@@ -25,19 +25,19 @@ class NodeActor:
 class RayActors:
     """Actors on the nodes of a Ray cluster.
 
-    Ray restarts an actor that dies, on its node of the cluster or, if that is lost, on another one,
-    and repeats its call. Ray carries no data of steps: it only passes the function to run, the
-    place of the caller, and the secret.
+    If an actor dies, Ray restarts it on the same node of the cluster, or on another node if that
+    node is lost, and repeats its call. Ray carries no data of steps: it only passes the function to
+    run, the place of the caller, and the secret.
 
     Attributes:
         address: address of this machine in the cluster.
-        workers: number of actors, without spare ones.
+        workers: number of actors, without spare actors.
 
     Raises:
         MissingExtraError: Ray is not installed.
         ConfigError: this program is not on a node of the cluster, or there are too few CPUs.
         NoAdmissibleWorkerError: all nodes are too busy.
-        WorkerError: no cluster.
+        WorkerError: there is no cluster.
     """
 
     def __init__(

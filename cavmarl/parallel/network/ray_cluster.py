@@ -32,9 +32,9 @@ class Node:
 def join() -> bool:  # whether `leave` has to be called
     """Join the cluster of this program, or start one on this machine.
 
-    A program that has called `ray.init` is a member already. Otherwise it joins the cluster at
-    `RAY_ADDRESS`, a cluster that `ray start` has started here, or a new cluster that ends with its
-    last user.
+    A program that has called `ray.init` is a member already. Otherwise, the program joins the
+    cluster at `RAY_ADDRESS`, a cluster that `ray start` has started here, or a new cluster, which
+    ends with its last user.
 
     Raises:
         ConfigError: the program is a Ray client outside of the cluster.
@@ -81,9 +81,9 @@ def leave() -> None:
 
 
 def nodes() -> list[Node]:
-    """Return the living nodes of the cluster, this one first."""
+    """Return the live nodes of the cluster, the node of this process first."""
     ray = require("ray", "ray")
-    from ray._private.state import available_resources_per_node  # Ray has no public name for it
+    from ray._private.state import available_resources_per_node  # Ray has no public API for it
 
     free: dict[str, dict[str, float]] = available_resources_per_node()
     here = ray.get_runtime_context().get_node_id()

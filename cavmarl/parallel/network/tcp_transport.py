@@ -69,7 +69,7 @@ class TcpListener:
     def __init__(
         self,
         address: str,
-        secret: bytes | None = None,  # None: a random one
+        secret: bytes | None = None,  # None: a random secret
         port: int = 0,  # 0: the system chooses
     ) -> None:
         self._listener = Listener(address, secret, port)

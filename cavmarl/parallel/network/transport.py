@@ -43,7 +43,7 @@ class Connection(Protocol):
         """Send the pieces in order; return the number of bytes that the system has accepted.
 
         Raises:
-            OSError: the other end has gone.
+            OSError: the other end has disconnected.
         """
         ...
 
@@ -51,7 +51,7 @@ class Connection(Protocol):
         """Read into `room`; return the number of bytes, 0 if none has arrived or the end closed.
 
         Raises:
-            OSError: the other end has gone.
+            OSError: the other end has disconnected.
         """
         ...
 
@@ -97,7 +97,7 @@ class Transport(Protocol):
     def open(
         self,
         place: Place,
-        secret: bytes,  # known to both ends
+        secret: bytes,  # known to both processes
         number: int,  # sent to the listener
         answer_s: float | None,  # time for the listener to answer; None: unlimited
     ) -> Connection:

@@ -1,1 +1,1 @@
-"""Worlds over nodes: processes without shared memory, each with some zones of the worlds."""
+"""Worlds on nodes: processes without shared memory, each with some zones of the worlds."""

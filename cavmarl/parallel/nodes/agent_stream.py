@@ -58,7 +58,7 @@ def _size(tables: Sequence[Array]) -> int:
 
 
 def _read(data: memoryview) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-    """Return the whole words of a frame, and its bytes. Raises MessageError: it is too short."""
+    """Return the whole words and the bytes of a frame. Raises MessageError: it is too short."""
     if len(data) < 8:
         raise MessageError(f"{len(data)} bytes are not a frame about agents")
     return np.frombuffer(data, np.int64, len(data) // 8), np.frombuffer(data, np.uint8)
@@ -94,7 +94,7 @@ class AgentStream:
         return room.data[: self._pack(self._mine, self._tables, room.words, room.data)].data
 
     def read(self, data: memoryview, number: int, owner: NDArray[np.int32]) -> NDArray[np.int64]:
-        """Write the frame of node `number` to the tables, and note that it owns these agents.
+        """Write the frame of node `number` to the tables; record the node as owner of its agents.
 
         Returns:
             the agents of that node.

@@ -36,7 +36,7 @@ class JoiningNode:
     asked: int  # the number that it was started with, or ANYONE
     machine: str = "a machine"
     pid: int = 0  # process id on the machine of the node
-    is_accepted: bool = False  # it runs the same code as the caller
+    is_accepted: bool = False  # whether the node runs the same code as the caller
     place: Place | None = None  # where other nodes can call, once it has loaded the world
     neighbours: Neighbours | None = None  # zones between which vehicles change, in that world
 
@@ -57,7 +57,7 @@ class JoiningNodes:
         listener: TransportListener,
         job: Any,  # JSON value for the nodes
         files: Sequence[WorldFile],  # files of the world
-        room: Callable[[], int],  # returns how many more nodes can be used
+        room: Callable[[], int],  # returns the number of further nodes that can be used
         zones: int,  # number of zones of each world
         system: NodeSystem = MACHINE,
     ) -> None:
@@ -99,7 +99,7 @@ class JoiningNodes:
 
         Raises:
             CavmarlError: a node has raised this error.
-            WorkerError: the nodes have not come in time.
+            WorkerError: the nodes have not joined in time.
         """
         until_s = self._links.now_s() + timeout_s
         log.info("waiting for %d nodes at %s", num, self.place)
@@ -173,7 +173,7 @@ class JoiningNodes:
                 "versions on all machines, since results would differ"
             )
         elif self._room() <= sum(each.is_accepted for each in self._all.values()):
-            why = "no more nodes are needed: all zones have a node, and a spare one waits"
+            why = "no more nodes are needed: all zones have a node, and a spare node waits"
         else:
             node.is_accepted = True
             self._links.send(number, FrameKind.JOB, 0, [self._job])

@@ -1,4 +1,4 @@
-"""Length of the leases of nodes: at most one step, because its commands are known in advance.
+"""Length of the leases of nodes: at most one step, since a step's commands are known in advance.
 
 A vehicle that crosses a border during a lease stays with its owner until the next lease. Only a
 vehicle with a record can be offered. A lease of 0 ticks first gives new vehicles their records.
@@ -22,7 +22,7 @@ def leases_of(ticks: int, lease: int) -> int:
 
 
 def late_ticks(config: EnvConfig) -> int:
-    """Return for how many extra ticks, beyond one, a zone may keep a vehicle that has left it.
+    """Return the number of ticks, beyond one, for which a zone may keep a vehicle that has left it.
 
     Simulators of zones may refuse the vehicle for `zones.max_deferred_ticks` leases.
     """

@@ -66,7 +66,7 @@ class FrameKind(IntEnum):
     REFUSED = 19  # C → N: why the node is rejected
     END = 20  # C → N: the node is not needed any more
     GIVE = 21  # N → N: the state of zones that move to another node
-    NOT_MINE = 22  # N → C: agents whose actions came to the wrong node, and their owners
+    NOT_MINE = 22  # N → C: agents whose actions were sent to the wrong node, and their owners
     ACTIONS = 23  # C → N: forwarded actions
     EXCHANGE = 24  # N → C: sent messages, for a network simulator
     RECEPTIONS = 25  # C → N: received messages, from the network simulator
@@ -76,11 +76,11 @@ class NodeFrame(NamedTuple):
     """A received frame."""
 
     kind: FrameKind
-    number: int  # its meaning depends on the kind
+    number: int  # a number whose meaning depends on the kind
     data: memoryview
 
     def is_of(self, generation: int, is_known: bool) -> bool:
-        """Return whether the frame is of this generation of nodes, and not of an earlier one.
+        """Return whether the frame is of this generation of nodes, not of an earlier generation.
 
         `is_known`: whether its sender has sent a frame of this generation before.
 
@@ -166,7 +166,7 @@ class Link:
         """Read received bytes; append urgent frames to `urgent`, with the number of this link.
 
         Raises:
-            EOFError, OSError: the other end has gone.
+            EOFError, OSError: the other end has disconnected.
             MessageError: the bytes are not a frame.
             NeededNoMoreError, NodeRefusedError: the coordinator has dismissed this node.
         """

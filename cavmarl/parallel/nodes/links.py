@@ -18,7 +18,7 @@ from cavmarl.parallel.nodes.peer_faults import LinkLostError, reading
 LOST = (EOFError, OSError, MessageError)  # errors that end a connection
 
 Urgent: TypeAlias = Callable[[int, NodeFrame], Exception | None]
-"""Handles an urgent frame as soon as it has come; the first argument is its sender.
+"""Handles an urgent frame as soon as it has arrived; the first argument is its sender.
 
 An error in the handler is the fault of the sender. `pump` raises an error that the
 handler returns."""
@@ -35,7 +35,7 @@ class AwaitedOffer(NamedTuple):
 
 
 class SilenceError(Exception):
-    """An awaited frame has not come in time.
+    """An awaited frame has not arrived in time.
 
     Attributes:
         offers: offers whose answers are awaited.
@@ -68,7 +68,7 @@ class Links:
         self._looks = system.looks
         self._links: dict[int, Link] = {}
         self._poll = system.poll()
-        self._by_place: dict[int, tuple[int, Link]] = {}  # by the numbers of the poll
+        self._by_place: dict[int, tuple[int, Link]] = {}  # number of the poll → number and link
         self._urgent_frames: deque[tuple[int, NodeFrame]] = (
             deque()
         )  # urgent frames, and their senders
@@ -101,7 +101,7 @@ class Links:
         """Send a frame.
 
         Raises:
-            LinkLostError: the other end has gone.
+            LinkLostError: the other end has disconnected.
         """
         try:
             link = self._links[to]
@@ -122,8 +122,8 @@ class Links:
         """Receive the next frame of each sender.
 
         Raises:
-            LinkLostError: a sender has gone.
-            SilenceError: a frame has not come in time.
+            LinkLostError: a sender has disconnected.
+            SilenceError: a frame has not arrived in time.
             RecoveryOrderedError: the coordinator has ordered a recovery.
         """
         links, is_member = self._links, COORDINATOR not in wanted
@@ -170,7 +170,7 @@ class Links:
     def check_recovery(self) -> None:
         """Raise RecoveryOrderedError if the coordinator has ordered a recovery.
 
-        In a recovery an awaited frame may never come: the loss of its sender may be unnoticed here.
+        During a recovery, an awaited frame may never arrive, since its sender may be lost.
         """
         link = self._links.get(COORDINATOR)
         if link is None or not link.frames:
@@ -179,19 +179,19 @@ class Links:
             raise RecoveryOrderedError(None)
 
     def receive_if_there(self, number: int) -> NodeFrame | None:
-        """Return the next frame of a sender, if it has come."""
+        """Return the next frame of a sender, if it has arrived."""
         frames = self._links[number].frames
         return frames.popleft() if frames else None
 
     def await_urgent(self, number: int, has_come: Callable[[], bool]) -> None:
-        """Wait for an urgent frame that a sender has to send before its next other frame.
+        """Wait for an urgent frame that a sender has to send before its next non-urgent frame.
 
         Args:
             number: number of the sender, another node.
-            has_come: returns whether the urgent frame has come and was handled.
+            has_come: returns whether the urgent frame has arrived and was handled.
 
         Raises:
-            LinkLostError: the sender has gone, or has not sent the frame.
+            LinkLostError: the sender has disconnected, or has not sent the frame.
             RecoveryOrderedError: the coordinator has ordered a recovery.
         """
         self.wanted = (number,)
@@ -221,11 +221,11 @@ class Links:
         self._links[number].frames.appendleft(frame)
 
     def pump(self, timeout_ms: float | None, looks: int = 0) -> None:
-        """Send and receive on all ready connections; wait up to `timeout_ms` until one is ready.
+        """Send and receive on ready connections; wait up to `timeout_ms` for a ready connection.
 
         Poll `looks` times before the process sleeps.
         """
-        if self._urgent_frames:  # an earlier urgent frame raised an error, so these were left
+        if self._urgent_frames:  # frames left after an earlier urgent frame raised an error
             self._deliver()
             return
         began_s = self.now_s()

@@ -1,9 +1,9 @@
 """`Actions`: actions of agents in a step, which go to the nodes that own their vehicles.
 
 The caller knows which node sensed for an agent last. After nodes were lost, or zones have moved,
-the owner may be another node. A node that receives an action of an agent that it does not own
-refuses it with the number of the owner, and the caller forwards the action. A node waits until it
-has the actions of all its agents.
+the owner may be another node. If a node receives an action for an agent of another node, it refuses
+the action and names the owner. Then the caller forwards the action. A node waits until it has the
+actions of all its agents.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class ReceivedActions:
         self.are_due = False  # whether actions of agents of this node are missing
 
     def due(self) -> list[int]:
-        """Return the agents of this node whose actions are missing in the present step."""
+        """Return the agents of this node whose actions are missing in the current step."""
         return np.flatnonzero(self._missing).tolist() if self.are_due else []
 
     def begin(self, owner: NDArray[np.int32]) -> None:

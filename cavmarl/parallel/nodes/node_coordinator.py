@@ -57,7 +57,7 @@ class _World:
         self.movers: list[tuple[int, int]] = []
         self.births: list[Birth] = []
         self.answered: set[tuple[int, int]] = set()
-        self.has_stepped = False  # whether each zone has received a STEP in the present episode
+        self.has_stepped = False  # whether each zone has received a STEP in the current episode
         self.has_begun = False  # whether the first reset is done; before, rows have no episode
         self.on_record = OwnersOnRecord(zones, limits) if is_checked else None
 
@@ -88,7 +88,7 @@ class _World:
         return self.has_stepped and not (births or self.movers or is_watched)
 
     def write(self, output: Output) -> int:
-        """Write records; return the number of vehicles whose owner they change."""
+        """Write records; return the number of vehicles whose owner the records change."""
         if not output.records:
             return 0
         if self.journal is not None:
@@ -113,7 +113,7 @@ class NodeCoordinator:
         runs: Sequence[bytes],  # run of each world
         node_of: Sequence[int],  # zone → node
         limits: Limits,
-        links: Links,  # to all nodes
+        links: Links,  # connections to all nodes
         journals: Sequence[Journal | None],  # journal of each world
         is_checked: bool = False,  # whether to compare rows of vehicles with the records
     ) -> None:
@@ -171,7 +171,7 @@ class NodeCoordinator:
         return [[world.directory.hosting(zone) for zone in zones] for world in self.worlds]
 
     def receive(self, number: int, frame: NodeFrame) -> None:
-        """Apply acknowledgements as soon as they come.
+        """Apply acknowledgements as soon as they arrive.
 
         Raises:
             MessageError: the frame has another message, or is about a zone of another node.
@@ -182,7 +182,7 @@ class NodeCoordinator:
             self._take(w, message)
 
     def _take(self, w: int, message: Message) -> None:
-        """Apply a message of a node. Raises MessageError: it does not fit the present tick."""
+        """Apply a message of a node. Raises MessageError: it does not match the tick."""
         dropped = self.worlds[w].directory.dropped
         before = dropped.total()
         self._apply(w, message)
@@ -196,7 +196,7 @@ class NodeCoordinator:
         self,
         number: int,  # number of a node
         messages: Sequence[tuple[int, Message]],
-        reports: Sequence[Report] = (),  # one for each world, or none at all
+        reports: Sequence[Report] = (),  # one report for each world, or no reports
     ) -> None:
         """Check messages of a node.
 
@@ -320,7 +320,7 @@ class NodeCoordinator:
             raise LinkLostError(node, MessageError(str(error))) from error
 
     def _commit(self, world: _World) -> None:
-        """Commit a tick of a world. Raises LinkLostError: the DONE of a node does not fit."""
+        """Commit a tick of a world. Raises LinkLostError: the DONE of a node is wrong."""
         try:
             world.write(world.directory.commit(dict.fromkeys(range(len(self._node_of)), 0)))
         except ZonesError as error:

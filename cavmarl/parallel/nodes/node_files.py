@@ -28,7 +28,7 @@ class WorldFile(NamedTuple):
 
     key: str
     nth: int  # index among the files of the key; -1: the key names a single file
-    path: str  # on the machine of the caller
+    path: str  # path on the machine of the caller
     digest: str  # SHA-256 of the content
 
     @property

@@ -1,4 +1,4 @@
-"""`NodeGroups`: worlds over nodes, where each node hosts whole worlds."""
+"""`NodeGroups`: worlds distributed over nodes; each node hosts whole worlds."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ Found = TypeVar("Found")
 
 
 class NodeGroups(CommandedWorlds):
-    """W worlds over n nodes, where each node hosts all zones of its worlds.
+    """W worlds distributed over n nodes; each node hosts all zones of its worlds.
 
     Each node has a coordinator and a thread of its own, so all nodes carry out a command at once.
     This process keeps the state of the worlds of each node: if a node is lost, another one resumes
@@ -47,7 +47,7 @@ class NodeGroups(CommandedWorlds):
         groups: the worlds of each node.
 
     Raises:
-        ConfigError: a setting that such worlds do not support, or more nodes than worlds.
+        ConfigError: a setting is not supported, or there are more nodes than worlds.
         MissingExtraError: Ray is not installed.
         WorkerError: a node cannot be started.
     """
@@ -60,7 +60,7 @@ class NodeGroups(CommandedWorlds):
         base_dir: Path,  # folder of relative paths
         num_worlds: int,  # W
         backend: BackendName,  # n nodes, from 1 to W
-        in_next_step: bool = False,  # when new episodes start; see `SteppedWorlds`
+        in_next_step: bool = False,  # whether new episodes start a step later; see `SteppedWorlds`
         *,
         route: Route = straight,  # maps a place to the place that nodes of this machine call
         system: NodeSystem = MACHINE,
@@ -134,7 +134,7 @@ class NodeGroups(CommandedWorlds):
         return tuple(chain.from_iterable(group.transfers for group in self.groups))
 
     def node_loads(self) -> list[NodeLoad]:
-        """Return the load of each node since the previous call, in rising order."""
+        """Return the load of each node since the previous call, in ascending order of nodes."""
         found = self._run_jobs(NodeWorlds.node_loads, self.groups, _ignore)
         return [load._replace(node=k) for k, loads in enumerate(found) for load in loads]
 
@@ -197,8 +197,8 @@ class NodeGroups(CommandedWorlds):
         return bisect_right(self._bounds, world) - 1
 
     def _send(self, task: Task, payload: Any, commits: bool) -> None:
-        """Let all nodes do a task; if it fails for a node, no worlds change."""
-        if task == Task.PACK:  # UNPACK does the whole move
+        """Run a task on all nodes; if the task fails on a node, no worlds change."""
+        if task == Task.PACK:  # UNPACK carries out the whole move
             return
         if task == Task.UNPACK:
             self._move(payload)
@@ -229,7 +229,7 @@ class NodeGroups(CommandedWorlds):
         undo: Callable[[Any], None],
         in_turn: bool = False,
     ) -> list[Found]:
-        """Do jobs in parallel, or one after the other; if one fails, undo the others."""
+        """Run jobs in parallel, or one after the other; if a job fails, undo the other jobs."""
         running: list[Future[Found]] = []
         try:
             for job in jobs:
@@ -250,7 +250,7 @@ class NodeGroups(CommandedWorlds):
 
 
 def check_groups(world: World) -> None:
-    """Raise ConfigError for settings that whole worlds over nodes do not support."""
+    """Raise ConfigError for settings that whole worlds on nodes do not support."""
     config = world.config
     if config.workers.monitor_cpu:
         raise ConfigError(

@@ -9,9 +9,9 @@ from cavmarl.parallel.network.transport import READS, Connection, Place, Transpo
 from cavmarl.parallel.nodes.node_system import NodeSystem
 from cavmarl.parallel.nodes.peer_faults import LinkLostError
 
-LOOK_MS = 50.0  # time between checks that the awaited nodes still live
+LOOK_MS = 50.0  # time between checks that the awaited nodes are still alive
 ANSWER_S = 5.0  # time for a node to answer a call
-_MOST = 1 << 16  # limit of node numbers; generations are sent modulo this
+_MOST = 1 << 16  # limit of node numbers; generations are sent modulo this limit
 
 
 def caller_number(number: int, generation: int) -> int:
@@ -65,5 +65,5 @@ def call_node(
     """
     try:
         return system.open(place, secret, caller_number(number, generation), ANSWER_S)
-    except (OSError, EOFError, MessageError, ValueError) as error:  # `place` may be anything
+    except (OSError, EOFError, MessageError, ValueError) as error:  # `place` may have any value
         raise LinkLostError(of) from error

@@ -54,7 +54,7 @@ class NodePeers(Peers):
     def __init__(
         self,
         simulation: Simulation,
-        links: Links,  # to all other nodes
+        links: Links,  # connections to all other nodes
         zones: Sequence[Sequence[int]],  # zones of each node
         number: int,  # number of this node
         generation: int = 0,  # number of changes of nodes
@@ -91,7 +91,7 @@ class NodePeers(Peers):
         self._sent = generation << SHARE_BITS  # number of the last share
         self._is_stepping = False
         self._gate: DepartureQueue | None = None
-        self._leaving: Passing  # vehicles that pass `_gate`
+        self._leaving: Passing  # vehicles that leave through the departure queue `_gate`
         self.own: Array = np.zeros_like(simulation.outputs.present)
         self.stepped = self.own.copy()
         self.owner: NDArray[np.int32] = np.full(self.own.size, UNOWNED, dtype=np.int32)
@@ -109,7 +109,7 @@ class NodePeers(Peers):
             zoned.num_outer[zone, chosen] = -1
         for zone in range(len(zoned.num_rows)):
             for w in np.flatnonzero(chosen).tolist():
-                num = zoned.num_rows.item(zone, w)  # the first zone had the rows of all zones
+                num = zoned.num_rows.item(zone, w)  # the first zone had all vehicles
                 for array in (*zoned.rows[:, zone, w], *(each[zone, w] for each in self._of_rows)):
                     forget(array[num:])
         self._rerouted[chosen] = 0
@@ -196,7 +196,7 @@ class NodePeers(Peers):
                 _check_end(data, self._add_passing(departures, data, 0))
 
     def _passing(self, departures: DepartureQueue) -> list[Bytes]:
-        """Return the number of vehicles that pass the queue of each world, and their rows."""
+        """Return the number of leaving vehicles of each world, and their rows."""
         counts = departures.num_passing.copy()
         rows = [departures.passing[w, :num] for w, num in enumerate(counts.tolist()) if num]
         return [counts.data, *map(_bytes, rows)]
@@ -311,7 +311,7 @@ class NodePeers(Peers):
                 array[self._foreign] = 0
 
     def _swap(self, pieces: Sequence[Bytes]) -> Iterator[tuple[int, memoryview]]:
-        """Send pieces to all other nodes, and yield theirs, in rising order."""
+        """Send pieces to all other nodes, and yield their pieces in ascending order of nodes."""
         self._sent += 1
         for to in self._others:
             self._links.send(to, _SHARE, self._sent, pieces)
@@ -319,7 +319,7 @@ class NodePeers(Peers):
             yield number, self._share_of(number)
 
     def _share_of(self, number: int) -> memoryview:
-        """Receive the present share of another node.
+        """Receive the current share of another node.
 
         Raises:
             RecoveryOrderedError: the other node has already received an order to recover.
@@ -359,7 +359,7 @@ def _read(data: memoryview, at: int, kind: DTypeLike, num: int) -> tuple[Array, 
     dtype = np.dtype(kind)
     if not 0 <= num <= (len(data) - at) // dtype.itemsize:
         raise MessageError(
-            f"{len(data)} bytes have no {num} items of {dtype.itemsize} bytes at {at}"
+            f"{len(data)} bytes are too short for {num} items of {dtype.itemsize} bytes at {at}"
         )
     return np.frombuffer(data, dtype, num, at) if num else np.zeros(0, dtype), at + (
         num * dtype.itemsize

@@ -76,13 +76,13 @@ class NodePool:
         redirected: number of actions that were refused by a node and forwarded to the owner.
 
     Raises:
-        ConfigError: a setting that such worlds do not support, or more nodes than zones.
+        ConfigError: a setting is not supported, or there are more nodes than zones.
         WorkerError: a node cannot be started.
     """
 
     owner: NDArray[np.int32]
-    _performed: NodeCommand | None = None  # the present command
-    _exchanged = 0  # number of answers of a network simulator that nodes have received for it
+    _performed: NodeCommand | None = None  # the current command
+    _exchanged = 0  # number of answers of a network simulator sent for this command
 
     def __init__(
         self,
@@ -105,7 +105,7 @@ class NodePool:
         self._lost: list[int] = []
         self._failed: set[int] = set()  # nodes that have ended with an error of their own
         self._is_torn = False
-        self._successions = 0  # losses of the only node in the present command
+        self._successions = 0  # losses of the only node in the current command
         self._max_retries = config.workers.max_retries
         self.losses = self.recoveries = self.replacements = self.redirected = 0
         self._timeout_s, self._pid = config.workers.timeout_s, os.getpid()
@@ -115,7 +115,7 @@ class NodePool:
         self._links = Links(_nothing, system)
         self._refused: dict[int, int] = {}  # agent → node that has refused its action
         self._watch = NodeWatch(self._links, self._stopped, self._holder)
-        self._nodes: dict[int, JoiningNode] = {}  # living nodes
+        self._nodes: dict[int, JoiningNode] = {}  # live nodes
         self._present: set[int] = set()  # nodes that have sent a frame in this generation
         self._new: dict[int, tuple[str, int]] = {}  # new nodes → where other nodes can call
         self._lease_ticks, self._settings = lease_ticks(config), config.zones
@@ -204,7 +204,7 @@ class NodePool:
 
     @property
     def first(self) -> int:
-        """Number of the node that does the tasks of a single node."""
+        """Number of the node that carries out the tasks for a single node."""
         return self._living[0]
 
     @property
@@ -214,7 +214,7 @@ class NodePool:
 
     @property
     def machines(self) -> dict[int, tuple[str, int]]:
-        """Machine and process of each living node, by its number."""
+        """Machine and process of each live node, by its number."""
         return {number: (node.machine, node.pid) for number, node in self._nodes.items()}
 
     @property
@@ -234,7 +234,7 @@ class NodePool:
                 self._lost.remove(number)
 
     def _receive_all(self, kind: FrameKind) -> dict[int, NodeFrame]:
-        """Receive a frame of a kind from each living node, in rising order.
+        """Receive a frame of the given kind from each live node, in ascending order of nodes.
 
         Raises:
             LinkLostError: a node is lost, or has sent another kind.
@@ -266,7 +266,7 @@ class NodePool:
 
         Args:
             command: for all nodes.
-            read: reads the result of a node; an error in it is the fault of the node.
+            read: reads the result of a node; the node is at fault if `read` fails.
 
         Returns:
             what `read` returns for each node, the reporter first.
@@ -310,7 +310,7 @@ class NodePool:
             raise
 
     def _insist(self, command: NodeCommand | None, read: Read[Found]) -> list[Found]:
-        """Carry out a command, if any; recover and try again until no node is lost meanwhile."""
+        """Carry out a command, if any; after each loss of a node, recover and try again."""
         while self._failed:
             number = self._failed.pop()
             self._lose(LinkLostError(number, MessageError("it has ended with an error")))
@@ -466,7 +466,7 @@ class NodePool:
         """Forward actions that a node has refused to their owners.
 
         Raises:
-            MessageError: the agents or owners are unknown, or the node had no such actions.
+            MessageError: the agents or owners are unknown, or the node did not have their actions.
         """
         found = read_refusal(frame.data, self.owner.size, {*self._living} - {number})
         if (self.owner[found[0]] != number).any():
@@ -484,7 +484,7 @@ class NodePool:
         """Remove a lost node, and start another node in its place.
 
         Raises:
-            WorkerError: the node had not begun, and too many nodes were lost before they had begun.
+            WorkerError: too many nodes, including this node, were lost before they had begun work.
         """
         is_silent = isinstance(lost, SilentNodeError)
         lost = lost if is_silent else self._watch.most_missed(lost, self.generation)
@@ -507,9 +507,9 @@ class NodePool:
             raise WorkerError(why) from lost
 
     def _recover(self) -> None:
-        """Go back to the newest state of all nodes; living nodes take over zones of lost nodes.
+        """Go back to the newest state of all nodes; live nodes take over zones of lost nodes.
 
-        Zones whose home is another living node move to that node.
+        Zones whose home is another live node move to that node.
 
         Raises:
             LinkLostError: another node is lost.
@@ -534,7 +534,7 @@ class NodePool:
     def _moves(self) -> tuple[ZoneMoves, Bytes]:
         """Return the new zones of the nodes, and the replica of a state that only the caller has.
 
-        If the only node is lost, another one takes its place.
+        If the only node is lost, another node takes its place.
 
         Raises:
             WorkerDeathError: there is no replica of a lost node, or too many were lost.
@@ -550,7 +550,7 @@ class NodePool:
             name = name_of(state.zones[hosts[0]])
             cure = (
                 "The log says why each node was lost; make the environment again, with a larger "
-                f"workers.max_retries than {self._max_retries} if more losses are to be expected"
+                f"workers.max_retries than {self._max_retries} if you expect more losses"
             )
             raise WorkerDeathError(hosts[0], name, state.number, "step", causes, cure)
         if not self._nodes:
@@ -597,14 +597,14 @@ class NodePool:
         """Wait for the reports of all nodes on a tick, and commit it.
 
         Returns:
-            the results that came with the reports; the result of the reporter comes first.
+            the results that were sent with the reports, the reporter's result first.
 
         Raises:
             LinkLostError: a node is lost, or has sent a bad report.
         """
         reports, results = {}, {}
         frames = self._receive_all(FrameKind.REPORT)
-        for number in sorted(frames, key=self.reporter.__ne__):  # the others in rising order
+        for number in sorted(frames, key=self.reporter.__ne__):  # then in ascending order
             with reading(number):
                 messages, of_worlds, more = read_report(frames[number].data, len(self._runs))
                 self.coordinator.check(number, messages, of_worlds)

@@ -49,7 +49,7 @@ from cavmarl.parallel.worlds.tasks import WORLD_TASKS, Task, WorldTask, commands
 
 MEASURED_TICKS = 10  # one tick in 10 measures the costs of zones
 HANDSHAKE_S = 60.0  # time for the other nodes to call
-DIFFERENT = "differ on this machine from those of the caller in {}"
+DIFFERENT = "differ on this machine from the caller's files in {}"
 
 
 def _saved(payload: Any, first: int) -> dict[str, Any]:
@@ -96,14 +96,14 @@ class NodeProgram:
         self._network: RemoteNetwork | None = None
         self._number = -1  # the caller sends it with the first RECOVER
         self._generation = 0
-        self._synchronized: set[int] = set()  # nodes whose SYNC of this generation has come
-        # world, vehicle and zone of each offer that was answered lately
+        self._synchronized: set[int] = set()  # nodes whose SYNC of this generation has arrived
+        # world, vehicle and zone of each offer that was answered recently
         self._answered: list[tuple[int, int, int]] = []
-        # node → fault in one of its frames, kept since an earlier report may have been void
+        # node → fault in one of its frames, kept because an earlier report of it may be void
         self._faults: dict[int, str] = {}
         self._witness: int | None = None  # node that claims that a recovery is ordered
         self._actions: deque[NodeFrame] = deque()  # forwarded actions
-        # Tasks that each node does for its zones; the first node does all other tasks.
+        # Tasks that each node carries out for its zones; all other tasks are for the first node.
         self._of_all: dict[Task, Callable[[Any, memoryview, int], None]] = {
             Task.STEP: self._step,
             Task.RESET: self._reset,
@@ -238,7 +238,7 @@ class NodeProgram:
 
         Raises:
             NeededNoMoreError: the coordinator has dismissed this node.
-            LinkLostError: the coordinator has gone.
+            LinkLostError: the coordinator has disconnected.
         """
         while True:
             try:
@@ -276,7 +276,7 @@ class NodeProgram:
     def _report_missed(self, lost: LinkLostError) -> None:
         """Tell the coordinator that a node cannot be reached, or has sent a bad frame.
 
-        If a frame of the coordinator does not fit, the state of this node is wrong.
+        If a frame of the coordinator seems wrong, the state of this node is wrong.
         """
         is_coordinator = lost.peer == COORDINATOR
         if is_coordinator and (not lost.fault or self._number < 0):
@@ -345,7 +345,7 @@ class NodeProgram:
         """Drop the frames of earlier generations of another node.
 
         Raises:
-            LinkLostError: the node has gone, or has sent no SYNC.
+            LinkLostError: the node has disconnected, or has sent no SYNC.
             RecoveryOrderedError: the coordinator has ordered another recovery.
         """
         links, generation = self._links, self._generation
@@ -492,7 +492,7 @@ class NodeProgram:
         return self._results.packed(peers.own, chosen, peers.stepped, of_step, self._is_reporter)
 
     def _do_alone(self, task: Task, payload: Any) -> None:
-        """Let the first node do a task; the other nodes first send it their parts of the worlds."""
+        """Run a task on the first node, to which the other nodes send their parts of the worlds."""
         worlds, answer = self._worlds, list[Bytes]()
         with self._peers.whole(worlds.simulation):
             if self._is_first:
@@ -503,7 +503,7 @@ class NodeProgram:
 
     @property
     def _is_first(self) -> bool:
-        """True if this node does the tasks of a single node."""
+        """True if this node carries out the tasks for a single node."""
         return self._number == self._living[0]
 
     def _answer(self, pieces: Sequence[Bytes]) -> None:
@@ -532,10 +532,10 @@ def run_node(
     note: Callable[[str], None] = lambda text: None,  # receives notes on the progress
     system: NodeSystem = MACHINE,
 ) -> bool:
-    """Run a node until the caller dismisses it or has gone.
+    """Run a node until the caller dismisses it or disconnects.
 
     Returns:
-        True if the caller has dismissed the node, False if the caller has gone.
+        True if the caller has dismissed the node, False if the caller has disconnected.
 
     Raises:
         OSError: no process listens at the place.

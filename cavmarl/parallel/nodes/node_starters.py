@@ -43,15 +43,15 @@ class NodeStarter:
         self.count = count  # number of nodes
 
     def trouble(self, begun: Collection[int]) -> str | None:
-        """Return why a node will not come; restart nodes that were killed before they began.
+        """Return why a node will not join; restart nodes that were killed before they began work.
 
         Args:
-            begun: process ids of nodes that have begun and need no check.
+            begun: process ids of nodes that have begun work and need no check.
         """
         return None
 
     def retry(self, number: int, pid: int, is_silent: bool) -> str | None:
-        """Restart a node that was lost before it had begun; return why that is impossible."""
+        """Restart a node that was lost before it had begun work; return why that is impossible."""
         self.replace(number, is_silent)
         return None
 
@@ -77,7 +77,7 @@ class LocalNodes(NodeStarter):
         nodes: int,
         listener: TcpListener,
         place: Place,
-        max_retries: int,  # for nodes that are killed or stopped before they have begun
+        max_retries: int,  # for nodes that are killed or stopped before they begin work
     ) -> None:
         super().__init__(nodes)
         self._listener, self._place = listener, place
@@ -93,7 +93,7 @@ class LocalNodes(NodeStarter):
     def start(self, number: int) -> subprocess.Popen[Any]:
         """Start the process of a node."""
         arguments = map(str, (*self._place, number))
-        # Kept states and large frames are allocated again each time.
+        # Huge pages pay off, because kept states and large frames are allocated again each time.
         process = start_python(
             ["-m", NODE, *arguments], huge_heap(), stdin=subprocess.PIPE, text=True
         )
@@ -117,7 +117,7 @@ class LocalNodes(NodeStarter):
         return None
 
     def retry(self, number: int, pid: int, is_silent: bool) -> str | None:
-        if self._processes[number].pid != pid:  # it was replaced already
+        if self._processes[number].pid != pid:  # the process was replaced already
             return None
         if self._retries == 0:
             return self._ended(number)
@@ -135,7 +135,7 @@ class LocalNodes(NodeStarter):
             if status < 0
             else "see its standard error"
         )
-        return f"node {number} ended with exit status {status} before it had begun; {cure}"
+        return f"node {number} ended with exit status {status} before it had begun work; {cure}"
 
     def replace(self, number: int, is_silent: bool) -> None:
         self._processes[number].kill()
@@ -158,7 +158,7 @@ class RayNodes(NodeStarter):
         self,
         actors: RayActors,
         listener: TcpListener,
-        max_retries: int,  # for nodes that are lost before they have begun
+        max_retries: int,  # for nodes that are lost before they begin work
     ) -> None:
         super().__init__(actors.workers)
         self._actors = actors
@@ -171,8 +171,8 @@ class RayNodes(NodeStarter):
     def retry(self, number: int, pid: int, is_silent: bool) -> str | None:
         if self._retries == 0:
             return (
-                f"node {number}, an actor of Ray, was lost before it had begun, more often than "
-                f"workers.max_retries allows; `ray logs` has its output: remove the reason, or "
+                f"node {number}, an actor of Ray, was lost before it had begun work, more often "
+                "than workers.max_retries allows; `ray logs` has its output: remove the reason, or "
                 "raise workers.max_retries"
             )
         self._retries -= 1
@@ -202,7 +202,7 @@ class MpiNodes(NodeStarter):
 
     def retry(self, number: int, pid: int, is_silent: bool) -> str | None:
         mpi_transport().is_broken = True
-        return f"rank {number + 1} was lost before it had begun: {MPI_CURE}"
+        return f"rank {number + 1} was lost before it had begun work: {MPI_CURE}"
 
     def replace(self, number: int, is_silent: bool) -> None:
         """Raise WorkerDeathError: a lost rank cannot be replaced."""
@@ -261,7 +261,7 @@ def read_key(path: Path) -> bytes:
     """Read a key from a file that only this user can read.
 
     Raises:
-        ConfigError: the file cannot be read, is too short, or others can read it.
+        ConfigError: the file cannot be read, is too short, or other users can read it.
     """
     make = "make one: (umask 077; openssl rand -hex 32 > FILE), the same file on all machines"
     try:

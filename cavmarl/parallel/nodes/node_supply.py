@@ -43,9 +43,9 @@ class NodeSupply:
         base_dir: Path,  # folder of relative paths
         num_worlds: int,  # W of all pools
         backend: BackendName,
-        in_next_step: bool,  # when new episodes start; see `SteppedWorlds`
+        in_next_step: bool,  # whether new episodes start a step later; see `SteppedWorlds`
         *,
-        by_worlds: bool = False,  # each node hosts worlds of its own
+        by_worlds: bool = False,  # whether each node hosts worlds of its own
         route: Route = straight,  # maps a place to the place to call instead
         system: NodeSystem = MACHINE,
         start: Start = start_nodes,  # starts the nodes
@@ -55,7 +55,7 @@ class NodeSupply:
             LocalWorlds(without_journals(world), 1, warm=True)
         self._join_timeout_s = config.workers.join_timeout_s
         self._lock, self._pid = RLock(), os.getpid()
-        self._are_complete = False  # whether the pools have had all their nodes at some time
+        self._are_complete = False  # whether the pools have ever had all their nodes
         self._begun: list[int] = []  # process ids of the nodes of pools
         files = files_of(config, base_dir)
         self._starter, listener = start(backend, num_worlds, config.workers, base_dir, route)
@@ -79,10 +79,10 @@ class NodeSupply:
         return self.count - len(self._begun) + SPARES
 
     def look(self) -> bool:
-        """Serve joining nodes; return whether one is ready."""
+        """Serve joining nodes; return whether a node is ready."""
         with self._lock:
             self.joining_nodes.look(0.0)
-            self._restart_dropped()  # if it is impossible, the lost node stays lost
+            self._restart_dropped()  # a node that cannot be restarted stays lost
             return bool(self.joining_nodes.ready)
 
     def take(
@@ -97,7 +97,7 @@ class NodeSupply:
 
         Raises:
             CavmarlError: a node has raised this error.
-            WorkerError: the nodes do not come in time.
+            WorkerError: the nodes do not join in time.
         """
 
         def why() -> str | None:
@@ -136,7 +136,7 @@ class NodeSupply:
             self._starter.replace(node.asked, is_silent)
 
     def retry(self, node: JoiningNode, is_silent: bool) -> str | None:
-        """Restart a node that was lost before it had begun; return why that is impossible."""
+        """Restart a node that was lost before it had begun work; return why that is impossible."""
         with self._lock:
             self._begun.remove(node.pid)
             return self._starter.retry(node.asked, node.pid, is_silent)

@@ -29,9 +29,9 @@ class NodeSystem(Transport, Protocol):
     def worlds_of(
         self,
         message: Mapping[str, Any],
-        trouble: str,  # error text in case that files differ
+        trouble: str,  # error text if files differ
         num_worlds: int,
-        in_next_step: bool,  # when new episodes start
+        in_next_step: bool,  # whether new episodes start a step later
     ) -> LocalWorlds:
         """Make the worlds of a message."""
         ...

@@ -12,8 +12,8 @@ from cavmarl.parallel.nodes.link import FrameKind, NodeFrame, read_list
 from cavmarl.parallel.nodes.links import AwaitedOffer, Links, SilenceError
 from cavmarl.parallel.nodes.peer_faults import LinkLostError, check_indices
 
-LOOK_S = 0.5  # time between checks; a process that is stopped at two checks is given up
-PONG_S = 1.0  # time for a living node to answer a PING
+LOOK_S = 0.5  # time between checks; a process that is stopped at two checks counts as lost
+PONG_S = 1.0  # time for a live node to answer a PING
 MISSED_S = 0.1  # time to collect reports of lost connections
 VAIN = 5  # number of PINGs that all nodes answer before an unfinished command fails
 
@@ -87,8 +87,8 @@ class NodeWatch:
         """Call `wait` until it succeeds, as long as all nodes answer.
 
         Raises:
-            SilentNodeError: a node does not answer, its process is stopped, a process awaits a
-                frame of it, or its offer or answer to an offer is missing after two timeouts.
+            SilentNodeError: a node does not answer; its process is stopped; another process awaits
+                its frame; or its offer or its answer to an offer is missing after two timeouts.
             WorkerError: all nodes answer, but `wait` does not succeed.
         """
         silence: SilenceError | None = None
@@ -120,7 +120,7 @@ class NodeWatch:
         try:
             return wait(left_s)
         except SilenceError as silence:
-            text = f"no frame has come for {timeout_s:g} s"
+            text = f"no frame has arrived for {timeout_s:g} s"
             raise SilenceError(text, silence.offers) from silence
 
     def _without_answer(self, offer: AwaitedOffer) -> SilentNodeError:
@@ -134,7 +134,7 @@ class NodeWatch:
         """Send a PING to all nodes, and evaluate the answers.
 
         Raises:
-            SilentNodeError: a node does not answer, or others wait for it.
+            SilentNodeError: a node does not answer, or other nodes wait for it.
         """
         links = self._links
         self._pings += 1
@@ -148,17 +148,17 @@ class NodeWatch:
             if number not in self._answered:
                 raise SilentNodeError(number, MessageError("it does not answer"))
         witnesses = (number for pong in self._answered.values() for number in pong.witnesses)
-        for number in witnesses:  # an order would have come before the PING
+        for number in witnesses:  # an order would have arrived before the PING
             if number in living:
-                raise SilentNodeError(number, MessageError("it claims an order to recover"))
+                raise SilentNodeError(number, MessageError("it claims that a recovery was ordered"))
         for pong in self._answered.values():
             for number in {self._holder(agent) for agent in pong.agents} & {*living}:
-                raise SilentNodeError(number, MessageError("it has not refused others' actions"))
+                raise SilentNodeError(number, MessageError("it has not refused foreign actions"))
         awaited = Counter(peer for pong in self._answered.values() for peer in pong.awaited)
         for number in sorted(living, key=lambda n: (self._waits(n, living), -awaited[n])):
             if awaited[number]:
-                raise SilentNodeError(number, MessageError("others wait for it"))
-        for number in links.awaited:  # a frame would have come before the answer to the PING
+                raise SilentNodeError(number, MessageError("other nodes wait for it"))
+        for number in links.awaited:  # a frame would have arrived before the answer to the PING
             if number in living and COORDINATOR in self._answered[number].awaited:
                 raise SilentNodeError(number, MessageError("its frame is missing"))
 
@@ -169,9 +169,9 @@ class NodeWatch:
     def most_missed(self, lost: LinkLostError, generation: int) -> LinkLostError:
         """Return the node that is lost, after nodes have reported lost connections.
 
-        The lost node is a node that has ended; if none has, the node that has sent bad frames to
-        most nodes; if none has, the node that most nodes cannot reach. If two nodes cannot reach
-        each other, either may be at fault, so they are given up in turn.
+        If a node has ended, it is the lost node; otherwise, the node that has sent bad frames to
+        most nodes; without bad frames, the node that most nodes cannot reach. If two nodes cannot
+        reach each other, either may be at fault, so they count as lost in turn.
 
         Args:
             lost: the first report.
@@ -197,6 +197,6 @@ class NodeWatch:
         return LinkLostError(worst, MessageError("other nodes do not reach it"))
 
     def forget_missed(self) -> None:
-        """Drop reports of lost connections after a node was given up."""
+        """Drop reports of lost connections after a node was declared lost."""
         self._missed.clear()
         self._faults.clear()

@@ -72,14 +72,14 @@ class WorldShare(NamedTuple):
 
 
 class NodeWorlds(CommandedWorlds):
-    """W worlds over n nodes, which share the zones of each world.
+    """W worlds distributed over n nodes, which share the zones of each world.
 
     Attributes:
         pool: the nodes.
         repartitions: past changes of the zones.
 
     Raises:
-        ConfigError: a setting that such worlds do not support, or more nodes than zones.
+        ConfigError: a setting is not supported, or there are more nodes than zones.
         WorkerError: a node cannot be started.
     """
 
@@ -91,7 +91,7 @@ class NodeWorlds(CommandedWorlds):
         base_dir: Path,  # folder of relative paths
         num_worlds: int,  # W
         backend: BackendName,  # n nodes, from 1 to the zones of a world
-        in_next_step: bool = False,  # when new episodes start; see `SteppedWorlds`
+        in_next_step: bool = False,  # whether new episodes start a step later; see `SteppedWorlds`
         *,
         route: Route = straight,  # maps a place to the place that nodes of this machine call
         system: NodeSystem = MACHINE,
@@ -242,7 +242,7 @@ class NodeWorlds(CommandedWorlds):
             self.perform(task, payload)
 
     def perform(self, task: Task, payload: Any = None) -> None:
-        """Let all nodes do a task, and write its outputs to `arrays`."""
+        """Run a task on all nodes, and write its outputs to `arrays`."""
         content = worlds_payload(payload) if task == Task.LOAD else payload
         results = self._run(task, content, self._readers.get(task, unread))
         arrays = self.arrays
@@ -259,7 +259,7 @@ class NodeWorlds(CommandedWorlds):
         """Do nothing: the pool has noted the new zones."""
 
     def _run(self, task: Task, payload: Any, read: Read[Found]) -> list[Found]:
-        """Let all nodes do a task; return what `read` returns for each result."""
+        """Run a task on all nodes; return what `read` returns for each result."""
         try:
             return self.pool.run(self._make_command(task, payload), read)
         except NetworkFailedError as failed:
@@ -320,7 +320,7 @@ class NodeWorlds(CommandedWorlds):
         states[...] = np.frombuffer(data, states.dtype).reshape(states.shape)
 
     def node_loads(self) -> list[NodeLoad]:
-        """Return the load of each node since the previous call, in rising order.
+        """Return the load of each node since the previous call, in ascending order of nodes.
 
         The load of a node that has replaced a lost node counts from the start of the new node.
         """
@@ -380,7 +380,7 @@ class NodeWorlds(CommandedWorlds):
 
     @property
     def partition(self) -> ZonePartition:
-        """The present zones, which repartitioning changes."""
+        """The current zones, which repartitioning changes."""
         return read_zones(self.pool.partition)
 
     def _pids(self) -> dict[int, int]:
@@ -430,7 +430,7 @@ def _read_totals(number: int, data: memoryview) -> tuple[int, list[Any]]:
     """Read the report of a node about itself; see `node_loads.totals`."""
     report = read_json(data, list)
     if len(report) != 1 + TOTALS or report[0] != number:
-        raise MessageError(f"it reports the load {report!r}")
+        raise MessageError(f"it reports the invalid load {report!r}")
     return number, list(map(float, report[1:5])) + list(map(int, report[5:]))
 
 
@@ -448,7 +448,7 @@ def _read_links(number: int, data: memoryview) -> tuple[int, list[dict[str, Any]
     links = []
     for row in rows:
         if not isinstance(row, list) or len(row) != 1 + len(LinkQuality._fields):
-            raise MessageError(f"it reports the connection {row!r}")
+            raise MessageError(f"it reports the invalid connection {row!r}")
         to, is_encrypted, *values = row
         numbers = [None if value is None else float(value) for value in values]
         quality = LinkQuality(bool(is_encrypted), *numbers)._asdict()
@@ -457,7 +457,7 @@ def _read_links(number: int, data: memoryview) -> tuple[int, list[dict[str, Any]
 
 
 def check_nodes(world: World, nodes: int) -> None:
-    """Raise ConfigError for settings that worlds over nodes do not support."""
+    """Raise ConfigError for settings that worlds on nodes do not support."""
     config, count = world.config, world.partition.count
     if not 1 <= nodes <= count:
         raise ConfigError(

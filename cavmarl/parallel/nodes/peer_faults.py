@@ -51,7 +51,7 @@ class reading:
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         if isinstance(error, FAULTS) and not isinstance(error, JournalError):
             if not isinstance(error, MessageError):
-                error = MessageError(f"a frame of it cannot be read: {error!r}")
+                error = MessageError(f"one of its frames cannot be read: {error!r}")
             raise LinkLostError(self._peer, error) from error
 
 
@@ -71,7 +71,7 @@ def check_indices(what: str, found: Iterable[int] | NDArray[Any], count: int) ->
 
 
 def read_json(data: memoryview | bytes, kind: type[Any]) -> Any:
-    """Read a JSON value of a type from a frame. Raises MessageError: it has another type."""
+    """Read a JSON value of a type from a frame. Raises MessageError if the type differs."""
     try:
         value = json.loads(bytes(data))
     except (ValueError, RecursionError) as error:

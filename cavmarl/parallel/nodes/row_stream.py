@@ -36,7 +36,7 @@ Array = NDArray[Any]
 
 
 class _Room:
-    """Ghosts of the previous frame, and a buffer for the ghosts of the present frame."""
+    """Ghosts of the previous frame, and a buffer for the ghosts of the current frame."""
 
     def __init__(self, words: int) -> None:  # `words` of a ghost
         self._before, self.now = (_ghosts(np.empty((0, words), dtype=np.int64)) for _ in range(2))
@@ -49,7 +49,7 @@ class _Room:
             self.now = _ghosts(huge_zeros((num + num // 2, size), dtype=np.int64))
 
     def turn(self, num: int) -> None:
-        """Make the `num` present ghosts the previous ghosts."""
+        """Make the `num` current ghosts the previous ghosts."""
         self._before, self.now = self.now, self._before
         self.before = _ghosts(self._before.words[:num])
 
@@ -120,7 +120,7 @@ class RowStream:
 
         Args:
             side: side of the rows whose ghosts are sent.
-            passing: vehicles that leave by the departure queue.
+            passing: vehicles that leave through the departure queue.
         """
         sent = self._sent
         before = len(sent.before.words)
@@ -165,7 +165,7 @@ class RowStream:
 
 
 def passing_of(departures: DepartureQueue) -> Passing:
-    """Return the vehicles that leave by a departure queue, as views."""
+    """Return the vehicles that leave through a departure queue, as views."""
     return Passing(words_of(departures.passing), departures.num_passing, departures.counts)
 
 

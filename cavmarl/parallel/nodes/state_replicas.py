@@ -1,7 +1,7 @@
 """`StateReplicas`: kept states of the zones of a node, and of the previous node of the ring.
 
 From time to time, between two steps, each node keeps its state, and sends a replica to the next
-living node. When a node is lost, the next node takes over its zones, and all nodes go back to the
+live node. When a node is lost, the next node takes over its zones, and all nodes go back to the
 newest state that all of them have. They repeat the commands since then, which gives the same bytes.
 When zones move to another node, for example a new node, all nodes also go back to a kept state.
 """
@@ -34,7 +34,7 @@ class StateReplicas:
 
     Attributes:
         own: states of this node, by their numbers.
-        others: node → states that it has sent, by their numbers.
+        others: node → states that the node has sent, by their numbers.
     """
 
     def __init__(
@@ -51,13 +51,13 @@ class StateReplicas:
         self._is_settled = True  # whether no state was kept since `settle`
 
     def begin_anew(self, worlds: LocalWorlds, logs: Sequence[ToldLog]) -> None:
-        """Switch to other worlds; replicas stay, since their senders may have switched before."""
+        """Switch to other worlds; replicas stay, since their senders may already have switched."""
         self._worlds, self._logs = worlds, logs
         self.own.clear()
         self._given.clear()
 
     def settle(self) -> None:
-        """Drop older states, since the newest one has arrived at all nodes."""
+        """Drop older states, since the newest state has arrived at all nodes."""
         if self._is_settled:
             return
         self._is_settled = True
@@ -67,7 +67,7 @@ class StateReplicas:
                 del states[old]
 
     def keep(self, state: int, living: Sequence[int]) -> list[Array]:
-        """Keep and return the present state, and send a replica to the next living node."""
+        """Keep and return the current state, and send a replica to the next live node."""
         saved = self._worlds.save()
         data = to_bytes(saved)
         _add(self.own, state, data)
@@ -102,9 +102,9 @@ class StateReplicas:
     def await_replica(
         self, state: int, zones: Sequence[Sequence[int]], like: Sequence[Array]
     ) -> None:
-        """Wait for the state of the previous living node, check it, and keep it.
+        """Wait for the state of the previous live node, check it, and keep it.
 
-        So a damaged state is detected while its sender is still alive.
+        The check detects a damaged state while its sender is still alive.
 
         Args:
             state: number of the state.
@@ -153,12 +153,12 @@ class StateReplicas:
     ) -> None:
         """Resume from a kept state.
 
-        Later states are dropped: otherwise they would count as the newest ones.
+        Later states are dropped; otherwise they would count as the newest states.
 
         Raises:
-            LinkLostError: a donor has gone, or its state is damaged.
+            LinkLostError: a donor has disconnected, or its state is damaged.
             RecoveryOrderedError: the coordinator has ordered another recovery.
-            WorkerError: the state of a lost node is not here.
+            WorkerError: this node has no replica of the state of a lost node.
         """
         for states in (self.own, *self.others.values()):
             _drop_later(states, state)
@@ -195,7 +195,7 @@ class StateReplicas:
         return donor in self._given and self._given[donor].number == generation
 
     def _read(self, data: Bytes, like: Sequence[Array]) -> list[Array]:
-        """Read a kept state. Raises ConfigError: the worlds cannot resume from it."""
+        """Read a kept state. Raises ConfigError: the worlds cannot resume from the state."""
         saved = from_bytes(data, like)
         self._worlds.check(saved, is_whole=False)
         return saved
@@ -223,7 +223,7 @@ class StateReplicas:
             if not len(other[n]):
                 continue
             if len(saved[n]):
-                raise MessageError(f"its state has vehicles of zone {(n - first) % zones}, too")
+                raise MessageError(f"its state also has vehicles of zone {(n - first) % zones}")
             saved[n] = other[n]
             w = (n - first) // zones
             agents = other[n]["agent"][other[n]["agent"] >= 0]

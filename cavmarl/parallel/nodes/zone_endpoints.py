@@ -1,9 +1,9 @@
 """`ZoneEndpoints`: the zones of a node as endpoints of the ownership protocol.
 
 When a vehicle has crossed a border, its owner (the source) sends a PREPARE to the node of the zone
-in which the vehicle is. That node acknowledges the offer to the coordinator and to the source. The
-coordinator decides, and the next STEP of both zones contains the decision. Until then, the source
-keeps the vehicle.
+that contains the vehicle. That node acknowledges the offer to the coordinator and to the source.
+The coordinator decides, and the next STEP of both zones contains the decision. Until then, the
+source keeps the vehicle.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ _LENGTH = struct.Struct("<II")
 class Report(NamedTuple):
     """Data about a tick of a world for the coordinator, in addition to DONE."""
 
-    # vehicle, zone in which it is, digest of its state in hex
+    # vehicle, zone that contains it, digest of its state in hex
     movers: list[tuple[int, int, str]]
     births: list[tuple[int, int]]  # vehicle, first owner
     began: bool  # whether an episode has started after the tick
@@ -87,7 +87,7 @@ class ZoneEndpoints(OwnershipRuntime):
         node_of: Sequence[int],  # zone → node
         hostings: Sequence[Sequence[Hosting]],  # hostings of these zones, by worlds
         limits: Limits,
-        links: Links,  # to the coordinator and to all other nodes
+        links: Links,  # connections to the coordinator and to all other nodes
         carried: Sequence[NDArray[Any]],  # (W, A, …) actions and state of agents
         checks: IndexCheck,  # checks offered vehicles
         # output: world, vehicle and zone of each offer that was answered in the present or the
@@ -111,7 +111,7 @@ class ZoneEndpoints(OwnershipRuntime):
         # world, vehicle → node that has offered it last
         self._sources: dict[tuple[int, int], int] = {}
         self._division, self._checks = division, checks
-        self._answered, self._num_answered = answered, 0  # `_num_answered` before the present lease
+        self._answered, self._num_answered = answered, 0  # `_num_answered` before the current lease
         answered.clear()
         self._zones = frozenset(zones)
         self._node_of = node_of
@@ -221,7 +221,7 @@ class ZoneEndpoints(OwnershipRuntime):
             self._stirred[w] = True
 
     def go_on(self, saved: Sequence[SavedOwnership] | None) -> None:
-        """Start ownership again, with the vehicles in their present zones."""
+        """Start ownership again, with the vehicles in their current zones."""
         self.reset(np.ones(len(self._stirred), dtype=np.bool_))
 
     def in_flight(self, w: int) -> list[TransferInFlight]:
@@ -271,7 +271,7 @@ class ZoneEndpoints(OwnershipRuntime):
 
     def _complete(self, w: int) -> Iterable[Done]:
         gone, self._gone[w] = self._gone[w], {}
-        if gone and self._births[w]:  # a vehicle that comes and goes within a lease has no record
+        if gone and self._births[w]:  # vehicles that enter and leave in a lease have no record
             born = {vehicle for vehicle, _ in self._births[w]} & gone.keys()
             self._births[w] = [birth for birth in self._births[w] if birth[0] not in born]
             gone = {vehicle: reason for vehicle, reason in gone.items() if vehicle not in born}
@@ -279,7 +279,7 @@ class ZoneEndpoints(OwnershipRuntime):
         kept: dict[int, int] = {}
         for vehicle, reason in gone.items():
             zone = next((z for z, e in self._endpoints[w].items() if vehicle in e.owned), None)
-            if zone is None:  # the vehicle was born during the lease
+            if zone is None:  # the vehicle entered during the lease
                 kept[vehicle] = reason
             else:
                 left.setdefault(zone, []).append(Removed(vehicle, reason))
@@ -289,10 +289,10 @@ class ZoneEndpoints(OwnershipRuntime):
                 yield endpoint.complete(0, left.get(zone, ()))
 
     def _offer(self, w: int, began: bool) -> tuple[list[tuple[int, int, str]], bool]:
-        """Offer vehicles that have crossed a border to the zones in which they are.
+        """Offer vehicles that have crossed a border to the zones that contain them.
 
         Returns:
-            movers of the report, and whether vehicles without a record have also crossed a border.
+            `movers` of the report, and whether vehicles without a record have crossed a border.
         """
         division, endpoints = self._division, self._endpoints[w]
         check_all, self._stirred[w] = self._stirred[w] or began, False
@@ -316,7 +316,7 @@ class ZoneEndpoints(OwnershipRuntime):
         return movers, is_late
 
     def receive(self, number: int, frame: NodeFrame) -> None:
-        """Apply messages of another node as soon as they come."""
+        """Apply messages of another node as soon as they arrive."""
         messages = unpacked(frame.data)
         check_indices("world", (w for w, _ in messages), len(self._endpoints))
         for w, message in messages:
@@ -344,13 +344,13 @@ class ZoneEndpoints(OwnershipRuntime):
         """Apply a message of another node.
 
         Raises:
-            MessageError: the message does not fit the present tick.
+            MessageError: the message does not match the current tick.
         """
         (zone,) = self._zones.intersection(message.destinations())
         endpoint = self._endpoints[w][zone]
         if isinstance(message, Prepare):
             if message.episode == endpoint.episode + 1:
-                self._early.append((number, w, message))  # the other node received its lease first
+                self._early.append((number, w, message))  # the sender received its lease first
                 return
             self._sources |= {(w, offer.vehicle): number for offer in message.entries}
         elif isinstance(message, Abort):
@@ -473,7 +473,7 @@ class ZoneEndpoints(OwnershipRuntime):
             at += kept.nbytes
 
     def receive_agent(self, number: int, frame: NodeFrame) -> None:
-        """Keep the state of an agent from another node until its vehicle comes."""
+        """Keep the state of an agent from another node until its vehicle arrives."""
         w, _ = _LENGTH.unpack_from(frame.data)
         vehicle = int(np.frombuffer(frame.data, np.int64, 1, _LENGTH.size)[0])
         check_indices("world", [w], len(self._endpoints))

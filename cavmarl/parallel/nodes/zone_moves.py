@@ -20,7 +20,7 @@ class ZoneMoves(NamedTuple):
 
 
 def living_of(zones: Sequence[Sequence[int]]) -> list[int]:
-    """Return the nodes that host zones, in rising order."""
+    """Return the nodes that host zones, in ascending order."""
     return [number for number, some in enumerate(zones) if some]
 
 

@@ -58,7 +58,7 @@ class BackendName:
         return self.address == MPI
 
     def is_split(self, num_worlds: int) -> bool:
-        """Return whether processes or nodes share the zones of worlds, being more than worlds."""
+        """Return whether processes or nodes outnumber the worlds, and so share their zones."""
         return self.count is not None and self.count > num_worlds
 
 
@@ -71,7 +71,7 @@ def read_backend(
     """Return the backend that the arguments name; they have to agree.
 
     Args:
-        backend: one of `FORMS`; None: as the short forms say, or else local.
+        backend: one of `FORMS`; None: as in the short forms, by default `local`.
         workers: short form: N for `processes:N`, 0 for `local`.
         nodes: short form: N for `nodes:N`.
         registered: names of registered backends.

@@ -46,7 +46,7 @@ class CommandedWorlds(ABC):
         world: see `SteppedWorlds`.
         in_next_step: see `SteppedWorlds`.
         arrays: see `SteppedWorlds`.
-        placement: which worker or node hosts what.
+        placement: which worker or node hosts which shards.
         mover: changes the placement between steps; None: it does not change.
         pool: the processes.
     """
@@ -92,11 +92,11 @@ class CommandedWorlds(ABC):
 
     @abstractmethod
     def _send(self, task: Task, payload: Any, commits: bool) -> None:
-        """Let all workers or nodes do a task, and write its outputs to `arrays`."""
+        """Run a task on all workers or nodes, and write its outputs to `arrays`."""
 
     @abstractmethod
     def _ask(self, task: Task, world: int, payload: Any) -> Any:
-        """Let the worker or node of a world do a task, and return its answer."""
+        """Run a task on the worker or node of a world, and return its answer."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         raise copy_error()

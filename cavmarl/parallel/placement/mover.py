@@ -55,7 +55,7 @@ class Mover:
             self._steps += 1
             return None
         before = self._placement.plans
-        snapshot = seen()  # it may update `spent_s`
+        snapshot = seen()  # `seen` may update `spent_s`
         moves = self._placement.round(self._spent_s, self._steps, snapshot)
         self._steps = 1
         if not moves:

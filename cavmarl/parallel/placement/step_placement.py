@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 
 
 class StepPlacement:
-    """The plans of all workers: one plan of all worlds, or one of the zones of each world.
+    """The plans of all workers: one plan of all worlds, or one plan of the zones of each world.
 
     Raises:
         ConfigError: there are more workers than zones.

@@ -1,8 +1,8 @@
 """Placement of workers on cores: no two workers share a core while there are enough cores.
 
 Operating systems put processes that wake together on one core, where one process waits for the
-other, and take many steps to move one of them to a free core. A worker on a shared core is kept off
-the cores of the other workers. Otherwise the system is free to place it.
+other. Moving one of them to a free core then takes the system many steps. A worker that shared a
+core is kept off the cores of the other workers; the system may place it on any other core.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ UNKNOWN = -1  # what `process_barrier.present_core` returns without the compiler
 
 
 def homes(
-    cores: Sequence[int],  # where each process was seen
+    cores: Sequence[int],  # core where each process was seen
     usable: set[int],
 ) -> list[int]:  # different cores; empty if there are too few
     """Choose each process's core: where it was seen, unless an earlier process has that core."""
@@ -37,7 +37,7 @@ def keep_apart(
     pids: Sequence[int],  # ids of processes that work at the same time
     cores: Sequence[int],  # core where each process was seen; -1: unknown
 ) -> None:
-    """Keep each process off the cores of the others, if two of them shared a core."""
+    """Keep each process off the cores of the other processes, if two processes shared a core."""
     if len(set(cores)) == len(cores) or UNKNOWN in cores:
         return
     usable = usable_cores()

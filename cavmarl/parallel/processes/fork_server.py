@@ -20,7 +20,7 @@ from cavmarl.parallel.processes.process_barrier import WAKE
 from cavmarl.parallel.processes.watchdog import CHECK_S, STOPPED_CHECKS, is_stopped
 from cavmarl.parallel.processes.worker_loop import MAIL, MAX_MESSAGE
 
-ANSWER_MS = 2_000  # time to fork or reap; a server that takes longer is stopped or broken
+ANSWER_MS = 2_000  # time to fork or reap; a server that takes longer must be stopped or broken
 END_S = 1.0  # time for the server and its workers to end
 
 # One thread per worker: the processes themselves share the cores.
@@ -54,7 +54,7 @@ class Process:
     mail: list[bytes] = field(default_factory=list)  # received messages that are still unread
 
     def collect(self) -> None:
-        """Receive all messages that have come, and drop messages that are only wake-ups."""
+        """Receive all messages that have arrived, and drop messages that are only wake-ups."""
         with suppress(BlockingIOError, ConnectionResetError):
             while self.receive():
                 pass
@@ -63,7 +63,7 @@ class Process:
         """Receive one message; return False if the other end is closed.
 
         Raises:
-            BlockingIOError: no message has come.
+            BlockingIOError: no message has arrived.
             ConnectionResetError: the other end was closed before it had read all messages.
         """
         message = self.wire.recv(MAX_MESSAGE, socket.MSG_DONTWAIT)

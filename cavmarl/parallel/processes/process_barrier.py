@@ -293,7 +293,7 @@ class WakeSignal:
         return False
 
     def announce_sleep(self) -> None:
-        """Mark this side as asleep before its next number: its wait will be long."""
+        """Mark this side as asleep before it sets its next number: the next wait will be long."""
         self.mine[ASLEEP] = 1  # the other side sees this word before or with that number
 
     def sleep(self, number: int) -> bool:

@@ -13,7 +13,7 @@ STOPPED_CHECKS = 2  # checks in a row after which a process counts as stopped
 class Watchdog:
     """Checks a process from time to time while it has work to do.
 
-    A process that works uses the processor, or waits for it or for a disk. A process that is
+    A process that works uses the processor, or waits for the processor or a disk. A process that is
     stopped or sleeps does not continue by itself, unless its descendants work for it.
     """
 
@@ -40,7 +40,7 @@ class Watchdog:
         self._checks += 1
         self._stopped = self._stopped + 1 if state in "Tt" else 0
         is_still = state == "S"
-        if is_still:  # processes that it has started may work for it
+        if is_still:  # descendants may work for the process
             for child, ticks in map(_read_state_if_there, descendants(self._pid)):
                 is_still &= child not in AT_WORK
                 spent += ticks

@@ -59,7 +59,7 @@ class Job:
         task: int,  # number of the task, counted from 0 for each kind of job
         payload: Any,  # JSON value from the pool, often None
     ) -> Any:
-        """Do a task, and return its answer as a JSON value; None: no answer."""
+        """Carry out a task, and return its answer as a JSON value; None: no answer."""
         raise NotImplementedError
 
     def save(self) -> Arrays:
@@ -115,7 +115,7 @@ def _refuse_threads() -> None:
     threads = len(os.listdir("/proc/self/task"))
     if threads > 1:
         names = [thread.name for thread in threading.enumerate()]
-        raise RuntimeError(f"the fork server has {threads} threads, those of Python are {names}")
+        raise RuntimeError(f"the fork server has {threads} threads; Python's threads are {names}")
 
 
 def _read(fd: int, size: int) -> Any:
@@ -227,7 +227,7 @@ def _run_commands(job: Job, wake_signal: WakeSignal, slots: Sequence[Image]) -> 
             mine[ANSWER] = SILENT if answer is None else ANSWERED
             if answer is not None:
                 wake_signal.wire.send(MAIL + json.dumps(answer).encode())
-        mine[CORE] = core  # only now, since the pool polls this line all the time
+        mine[CORE] = core  # written this late, because the pool polls this cache line all the time
         wake_signal.post(number)
         if mine[ANSWER] != FAILED:
             try:
@@ -239,16 +239,16 @@ def _run_commands(job: Job, wake_signal: WakeSignal, slots: Sequence[Image]) -> 
 def _await(
     wake_signal: WakeSignal,  # shared with the pool
     order: int,  # number of the command
-    last_s: float,  # duration of the last real wait
+    last_s: float,  # duration of the last wait for a command that had not arrived
     work_s: float,  # duration of the work since then
-) -> float:  # duration of the last real wait, maybe this one
+) -> float:  # duration of the last such wait, possibly this one
     """Wait for a command; exit if the pool is closed."""
     if wake_signal.has(order):
         return last_s
     began = time.perf_counter()
     if not wake_signal.watch(order, last_s, work_s):
         while wake_signal.sleep(order):
-            # A payload may come before its command, so it stays unread.
+            # A payload may arrive before its command, so it stays unread.
             message = wake_signal.wire.recv(len(WAKE), socket.MSG_PEEK)
             wake_signal.wake()
             if not message:

@@ -40,7 +40,7 @@ class Death:
 
     worker: int  # number of the worker
     order: int  # number of the command in progress
-    cause: str  # signal, exit status, or why the process was given up
+    cause: str  # signal, exit status, or why the process counts as dead
     ordered_s: float  # when the command was sent
     noticed_s: float  # when the death was noticed
     replaced_s: float  # when the successor had received the command
@@ -93,19 +93,19 @@ class Pool:
         return [processor_s(pid) for pid in self.pids]
 
     def run(self, task: int, payload: Any = None, commits: bool = True) -> list[Any]:
-        """Let all workers do a task.
+        """Run a task on all workers.
 
         Returns:
             the answer of each worker.
 
         Raises:
             WorkerDeathError: too many processes died during the task; the pool is closed.
-            WorkerFailureError: a worker raised an exception; the state is that before the task.
+            WorkerFailureError: a worker raised an exception; the state is as before the task.
         """
         return self._command(self._all, task, payload, commits)
 
     def ask(self, worker: int, task: int, payload: Any = None) -> Any:
-        """Let one worker do a task that changes nothing. Raises the errors of `run`."""
+        """Run a task that changes nothing on one worker. Raises the errors of `run`."""
         return self._command((worker,), task, payload, False)[0]
 
     def ping(self) -> None:
@@ -137,7 +137,7 @@ class Pool:
         expected_s = self._lasted.get(task, 0.0)
         sleeps = expected_s > LONG_WORK_S
         if workers == self._all:
-            self._processes.keep_apart()  # by the cores of the last command
+            self._processes.keep_apart()  # uses the cores of the last command
         self._processes.order(workers, head, self._stale, mail, sleeps)
         self._await(workers, mail, expected_s, sleeps)
         self._lasted[task] = time.monotonic() - self._ordered_s
@@ -177,7 +177,7 @@ class Pool:
             asked = pending
             pending = self._pending()
             if pending and len(pending) < len(asked):
-                # Work is shared so that all workers finish at about the same time.
+                # All workers finish at about the same time, so first poll the other workers.
                 self._processes.drain_wakeups()
                 pending = [k for k in pending if not self._processes.watch(k, is_soon=True)]
             self._note_done(first, pending)
@@ -198,7 +198,7 @@ class Pool:
         self._note_done(first, pending)
 
     def _note_done(self, first: int, pending: list[int]) -> None:
-        """Set `done_s` in those of `deaths[first:]` whose successors have just finished."""
+        """Set `done_s` in each entry of `deaths[first:]` whose successor has just finished."""
         for death in self.deaths[first:]:
             if death.worker not in pending and isnan(death.done_s):
                 death.done_s = time.monotonic()
@@ -207,7 +207,7 @@ class Pool:
         return [k for k in self._open if not self._processes.has(k)]
 
     def _replace(self, k: int, cause: str, mail: bytes | None) -> None:
-        """Replace the process of a worker, which is dead or given up."""
+        """Replace the process of a worker, which is dead or hangs."""
         noticed_s = time.monotonic()
         try:
             found = self._processes.replace(k, mail, self._open)

@@ -44,7 +44,7 @@ class Program(NamedTuple):
     segments: tuple[Segment, ...]
     tasks: tuple[str, ...]  # name of each task, by its number
     pins: bool = False  # whether to pin each worker to a core of its own, if there are enough cores
-    # groups of workers that share their state, so that none can go on without the others; a worker
+    # groups of workers that share their state and cannot continue without each other; a worker
     # that is in no group has a state of its own
     teams: tuple[tuple[int, ...], ...] = ()
 
@@ -169,7 +169,7 @@ class WorkerProcesses:
     def drain_wakeups(self) -> None:
         """Drain the sockets, so that old messages do not wake this side again.
 
-        Each call reads one message per socket. Usually there is only one.
+        Each call reads one message per socket; usually, there are no more messages.
         """
         for k in self._woken_by:
             with suppress(BlockingIOError, ConnectionResetError):

@@ -25,7 +25,7 @@ class SensorTask(IntEnum):
 
 
 class SensorJob(Job):
-    """Senses for its share of the agents, like a zone that owns them and sees all others."""
+    """Senses for its share of the agents, like a zone that owns them and sees all vehicles."""
 
     def __init__(
         self,

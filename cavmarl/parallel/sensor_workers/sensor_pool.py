@@ -39,7 +39,7 @@ class SensorWorkerPlan(NamedTuple):
     """The settings for starting sensor workers."""
 
     module: str  # program of the workers
-    message: Mapping[str, Any]  # for the program; the descriptors of shared memory are added
+    message: Mapping[str, Any]  # message for the program, without descriptors of shared memory
     frames: Segment  # memory of the samples, closed together with the workers
     shape: SceneShape
     num_lines: tuple[int, ...]  # (S,) lines into which a frame of each sensor can be divided

@@ -57,7 +57,7 @@ class Shares:
 
     @property
     def divided(self) -> dict[int, list[tuple[int, tuple[int, int]]]]:
-        """For each sensor divided in the same way for all agents: worker and lines of each part.
+        """Worker and lines of each part, for each sensor that is divided equally for all agents.
 
         The time that a worker spends on other sensors cannot be attributed to lines.
         """
@@ -134,12 +134,12 @@ def divide(shares: Shares, costs: LineCosts) -> Shares:
             home == taker and other[:3] == unit[:3]
             for other, home in zip(units, homes, strict=True)
         ):
-            break  # the taker already writes a range of these frames, and can write only one
+            break  # the taker already writes a range of these frames, and can write only one range
         before = costs.part(unit.sensor, 0, unit.end)
         within = costs.part(unit.sensor, unit.begin, unit.end)
         line = costs.line_at(unit.sensor, before - within * wanted_s / cost_s)
         if not unit.begin < line < unit.end:
-            break  # no whole number of lines fits this division
+            break  # one of the workers would have no line
         given_s = cost_s * costs.part(unit.sensor, line, unit.end) / within
         units[number], costs_s[number] = unit._replace(end=line), cost_s - given_s
         units.append(unit._replace(begin=line))

@@ -55,7 +55,7 @@ class CheckpointLog:
         self.is_prepared = False  # whether the other image has the state at the end of the log
         self._images = [Image(segment) for segment in images]
         kept = [KeptLog(Segment(fd, 0)) for fd in descriptors[3:]]
-        self._logs = kept[::2], kept[1::2]  # for each image, by world
+        self._logs = kept[::2], kept[1::2]  # logs for each image, by world
         arrays = arrays_in(steps.map(), _layout(config, num_worlds, num_signals))
         self.entries = tuple(map(Commands, *(arrays[name] for name in COMMANDS)))
 
@@ -76,7 +76,7 @@ class CheckpointLog:
         self.is_prepared = False
 
     def prepare(self, state: Arrays, logs: Sequence[ToldLog] = ()) -> None:
-        """Write the present state to the other image, with which the log can restart."""
+        """Write the current state to the other image, with which the log can restart."""
         image = 1 - self.place.item(0)
         self._images[image].write(state)
         for kept, log in zip(self._logs[image], logs, strict=True):

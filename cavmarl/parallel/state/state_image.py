@@ -125,7 +125,7 @@ class Image:
         return True
 
     def _map_all(self) -> None:
-        """Map the segment at its present size, which another process may have changed."""
+        """Map the segment at its current size, which another process may have changed."""
         self._memory = self._segment.map()
         self._words = np.frombuffer(self._memory, dtype=np.int64)
 

@@ -59,5 +59,5 @@ class KeptLog:
             self._map_all()
 
     def _map_all(self) -> None:
-        """Map the segment at its present size, which another process may have changed."""
+        """Map the segment at its current size, which another process may have changed."""
         self._words = np.frombuffer(self._segment.map(), dtype=np.int64)

@@ -57,8 +57,8 @@ def from_bytes(content: bytes | bytearray | memoryview, like: Sequence[Array]) -
             raise ValueError("there are more arrays")
     except _UNREADABLE as error:
         raise ConfigError(
-            "the state is one of other worlds, or of another version of cavmarl, which has "
-            f"other arrays ({error}): use the environment and the version that saved it"
+            "the state belongs to other worlds, or to a version of cavmarl with other arrays "
+            f"({error}): use the environment and the version that saved the state"
         ) from error
     return found
 
@@ -69,12 +69,12 @@ def _read(file: BytesIO, end: int) -> Array:
     Raises one of `_UNREADABLE`.
     """
     if np.lib.format.read_magic(file) != (1, 0):
-        raise ValueError("an array has another header")
+        raise ValueError("an array has an unsupported header")
     size = file.read(2)
     shape, is_fortran, dtype = _parsed(size + file.read(int.from_bytes(size, "little")))
     count = prod(shape)
     if is_fortran or dtype.hasobject or count < 0 or count * dtype.itemsize > end - file.tell():
-        raise ValueError(f"an array of {dtype} and the shape {shape}")
+        raise ValueError(f"an array of {dtype} with the shape {shape}")
     array = np.empty(shape, dtype)
     file.readinto(array.reshape(-1).view(np.uint8).data)
     if dtype == np.bool_ and (array.view(np.uint8) > 1).any():

@@ -1,1 +1,1 @@
-"""Worlds over worker processes: the pool of the caller, and the jobs of the workers."""
+"""Worlds in worker processes: the pool of the caller, and the jobs of the workers."""

@@ -40,7 +40,7 @@ class HostedZones:
         self._sides: tuple[int, int] | None = None  # sides of the shards, if known
 
     def set_sides(self, side: int, next_side: int) -> None:
-        """Set the sides of the present and the next rows, as another process announced them."""
+        """Set the sides of the current and the next rows, as another process announced them."""
         if self._sides != (side, next_side):
             self._sides = side, next_side
             for shard in self._shards:
@@ -58,7 +58,7 @@ class HostedZones:
     def _run_timed(
         self, spent_s: NDArray[np.float64], phase: Phase, arguments: tuple[Any, ...]
     ) -> None:
-        """Run a phase zone by zone; the time counts for all ticks until the next timed one."""
+        """Run a phase zone by zone; the time counts for all ticks until the next timed tick."""
         if not self._alone:
             self._alone = [ShardGroup([shard]) for shard in self._shards]
             self._untimed = self._ticks  # the first run of new groups also loads their kernels

@@ -18,7 +18,7 @@ MAX_REPEAT_S = 0.04  # limit on the time that a successor needs to repeat the st
 
 
 class LoggedWorlds(WorkerWorlds):
-    """Worlds whose state is the image at the start of a log, followed by the steps in it."""
+    """Worlds whose state is the image at the start of a log, followed by the steps of the log."""
 
     def __init__(
         self,
@@ -26,7 +26,7 @@ class LoggedWorlds(WorkerWorlds):
         first: int,
         checkpoint_log: CheckpointLog,
         # whether `MAX_REPEAT_S` limits the log. Each step of a world that a team runs takes long,
-        # and an image of it takes almost as long, so only the number of steps limits its log.
+        # and an image takes almost as long, so only the number of steps limits its log.
         limits_repeat: bool,
     ) -> None:
         super().__init__(worlds, first)
@@ -68,7 +68,7 @@ class LoggedWorlds(WorkerWorlds):
             self._restart_log()
 
     def on_idle(self) -> None:
-        """Write the next image while the pool does not wait for it, if it is due.
+        """Write the next image, if it is due, while the pool does not wait for this worker.
 
         The log does not write two images in a row: the committed state may still start with the
         previous image, which the new image would overwrite.
@@ -85,7 +85,7 @@ class LoggedWorlds(WorkerWorlds):
         return self._log.is_full or self._repeat_s > MAX_REPEAT_S
 
     def _restart_log(self, is_prepared: bool = False) -> None:
-        """Let the log start with the present state, whose image may have been written already."""
+        """Let the log start with the current state, whose image may have been written already."""
         if not is_prepared:
             self._log.prepare(self.worlds.save(), self._sumo_logs)
         self._log.begin()

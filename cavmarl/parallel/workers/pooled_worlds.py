@@ -33,7 +33,7 @@ PROGRAM = "cavmarl.parallel.workers.job_factory"
 
 
 class PooledWorlds(CommandedWorlds):
-    """W worlds over m worker processes.
+    """W worlds distributed over m worker processes.
 
     Raises:
         ConfigError: a setting that worlds in worker processes do not support.
@@ -48,7 +48,7 @@ class PooledWorlds(CommandedWorlds):
         base_dir: Path,  # folder of relative paths
         num_worlds: int,  # W
         workers: int,  # m, from 1 to W times the zones of a world; more than W divide the worlds
-        in_next_step: bool = False,  # when new episodes start; see `SteppedWorlds`
+        in_next_step: bool = False,  # whether new episodes start a step later; see `SteppedWorlds`
         program: str | None = None,  # module that the processes run; None: `job_factory`
     ) -> None:
         self.world = world
@@ -116,7 +116,7 @@ class PooledWorlds(CommandedWorlds):
         self.placement.watch(self._pids())
 
     def _make_mover(self, num_worlds: int, workers: int) -> MovingMemory | None:
-        """Make the mover, and return the memory that workers share for it; None: nothing moves."""
+        """Make the mover, and return the memory that its workers share; None: nothing moves."""
         every = self.world.config.workers.balance_steps
         if not every or workers == 1:
             return None

@@ -2,12 +2,12 @@
 
 The first worker leads: it runs the tick as a single process would. Phases that are mostly
 independent for each zone are shared. The leader announces such a phase to the other members, runs
-it on its own zones, and continues when the members have run it on theirs. Between the phases it
-handles departures, signals and ownership alone.
+it on its own zones, and continues when the members have run it on their zones. Between the phases,
+the leader handles departures, signals and ownership alone.
 
 All arrays that shards write are shared memory (`shared_huge_pages`), and each row has one writer at
-a time. Between phases a member keeps scratch memory only. A phase depends on the arrays and on the
-leader's line of words, and on nothing else.
+a time. Between phases, a member keeps scratch memory only. A phase depends only on the arrays and
+on the leader's line of words.
 """
 
 from __future__ import annotations
@@ -214,7 +214,7 @@ class TeamMember:
         self._own.host(zones)
 
     def _leave_shared_core(self) -> None:
-        """Leave the core of a member with a lower number: both would wait for each other.
+        """Leave the core of a member with a lower number; the members would wait for each other.
 
         Operating systems put processes that wake together on one core, and take milliseconds to
         separate them.

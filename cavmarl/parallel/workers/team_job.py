@@ -79,7 +79,7 @@ class LedTeam:
         self._leader.end_after(LAST.get(task))
 
     def host(self, payload: Any) -> None:
-        """Do the task HOST, whose payload has the zones of each worker of each world."""
+        """Carry out the task HOST, whose payload has the zones of each worker of each world."""
         self.set_hosts(_hosts(payload[self._kept.first]))
 
     def set_hosts(self, hosts: NDArray[np.int64]) -> None:

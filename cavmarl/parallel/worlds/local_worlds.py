@@ -47,7 +47,7 @@ class LocalWorlds:
         num_worlds: int,  # W
         arrays: StepArrays | None = None,  # arrays to write; None: make new arrays
         warm: bool = False,  # whether to load all kernels now
-        in_next_step: bool = False,  # when new episodes start; see `SteppedWorlds`
+        in_next_step: bool = False,  # whether new episodes start a step later; see `SteppedWorlds`
         zeros: Zeros = huge_zeros,  # makes the arrays that shards write
         like: LocalWorlds | None = None,  # worlds of the same environment, whose tables are shared
         runs: Sequence[OpenRun] | None = None,  # see `Simulation`
@@ -360,7 +360,7 @@ class LocalWorlds:
         self.load(self.read_worlds(saved))
 
     def read_worlds(self, saved: Sequence[bytes]) -> list[NDArray[Any]]:
-        """Convert what `save_worlds` returned to what `load` expects; errors as `load_worlds`."""
+        """Convert what `save_worlds` returned to what `load` expects. Errors: see `load_worlds`."""
         zones = self.world.partition.count
         like = self.share_of(0)
         shares = [from_bytes(one, [*like[:-zones], like[-1]]) for one in saved]

@@ -40,7 +40,7 @@ TASK_NAMES = tuple(task.name.lower().replace("_", " ") for task in Task)
 
 
 class WorldTask(NamedTuple):
-    """How the process of the worlds does a task.
+    """How the process of the worlds carries out a task.
 
     Attributes:
         method: method of the worlds.
@@ -54,7 +54,7 @@ class WorldTask(NamedTuple):
     write: Callable[[Any], Any] = lambda found: found
 
     def perform(self, worlds: LocalWorlds, payload: Any, first: int = 0) -> Any:
-        """Do the task with worlds whose numbers start at `first`."""
+        """Carry out the task with worlds whose numbers start at `first`."""
         return self.write(self.method(worlds, **self.read(payload, first)))
 
 

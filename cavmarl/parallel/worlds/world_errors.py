@@ -23,8 +23,8 @@ def copy_error() -> ConfigError:
 def network_error() -> ConfigError:
     """Return the error for a network simulator with worlds in worker processes."""
     return ConfigError(
-        "v2x.channel.external: the network simulator is in the process of the caller, which "
-        "worlds in worker processes do not ask; use backend='local', or nodes"
+        "v2x.channel.external: worlds in worker processes cannot call a network simulator in the "
+        "process of the caller; use backend='local', or nodes"
     )
 
 

@@ -13,7 +13,7 @@ from cavmarl.core.extensions import extension_modules, load_plugins
 from cavmarl.engine.world_setup import World, make_world
 from cavmarl.networks.background_driver import background_drivers
 
-CHANGED = "have changed while workers started: try again"
+CHANGED = "have changed while workers were starting: try again"
 
 
 def make_world_message(world: World, base_dir: Path, **more: Any) -> dict[str, Any]:

@@ -52,7 +52,7 @@ def begin_step(
     worlds: Worlds,  # outputs: the rows of agents
     discrete: bool,  # whether actions are meta-actions
     meta_actions: NDArray[np.int64],  # (W, A), ACTION_*; not read for continuous actions
-    target_speeds: NDArray[np.float64],  # m/s, rising
+    target_speeds: NDArray[np.float64],  # m/s, ascending
 ) -> None:
     """Clear the sums of the step and, with discrete actions, set the controllers' targets."""
     for w in range(worlds.ticks.shape[0]):
@@ -296,7 +296,7 @@ def advance(
 
 @kernel
 def resolve(
-    # outputs: events and hit of the owned next_rows; num_contacts rises by one for each vehicle
+    # outputs: events and hit of the owned next_rows; num_contacts increases for each vehicle
     # that begins to touch another vehicle
     worlds: Worlds,
     scratch: Scratch,
@@ -326,7 +326,7 @@ def suggest(
     worlds: Worlds,  # input only
     scratch: Scratch,
     discrete: bool,  # whether to write meta-actions
-    target_speeds: NDArray[np.float64],  # m/s, rising; discrete only
+    target_speeds: NDArray[np.float64],  # m/s, ascending; discrete only
     lookahead_s: float,  # time in which a target speed should be reached; discrete only
     dt: float,  # length of a step, for which an action applies, s
     # (W, A, 2) output: throttle in m/s² and steering in rad, or the meta-action in [..., 0];

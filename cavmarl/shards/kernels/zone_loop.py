@@ -35,7 +35,7 @@ COMMITTED, NEXT = 0, 1  # items of `Members.sides`
 class Members(NamedTuple):
     """The zones in which a call runs a phase."""
 
-    numbers: NDArray[np.int64]  # (n,) the numbers of the zones, rising
+    numbers: NDArray[np.int64]  # (n,) the numbers of the zones, ascending
     frames: NDArray[np.void]  # FRAME (n,) of the spatial index of each zone
     sides: NDArray[np.int64]  # (2,) the halves of `ZoneState.rows` with committed and next rows
     zones: ZoneArrays  # the partition
@@ -97,7 +97,7 @@ def grid_of(members: Members, n: int) -> Grid:
     )
 
 
-# Arguments that `for_each_zone` passes to parameters of these names; callers pass all others.
+# `for_each_zone` passes arguments for parameters of these names; callers pass all other arguments.
 _OF_ZONE = {
     "worlds": "worlds",
     "rows": "worlds.rows",

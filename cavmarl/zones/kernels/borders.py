@@ -47,10 +47,10 @@ def find_near(
     # NEAR (2 C,) is written, in the order of zones and rows; a crossing precedes an approach
     out: NDArray[np.void],
 ) -> int:  # number of entries
-    """Find owned vehicles that have crossed a border or are near one.
+    """Find owned vehicles that have crossed a border or are near a border.
 
     A vehicle has crossed a border if it is farther than the hysteresis outside of its owner's zone.
-    It is near a zone if it would have crossed into that zone after `ahead_s` at its present
+    It is near a zone if it would have crossed into that zone after `ahead_s` at its current
     velocity.
     """
     found = 0
@@ -122,7 +122,7 @@ def _note(
 @kernel
 def pass_on(
     vehicle: int,
-    source: int,  # the present owner
+    source: int,  # the current owner
     row: int,  # the vehicle's probable row in the source zone
     target: int,  # the next owner
     epoch: int,  # epoch of the new ownership

@@ -42,7 +42,7 @@ def exchange(
     zoned: ZoneState,
     side: int,  # the buffer of rows, 0 or 1
     first: int,  # the first world
-    last: int,  # one after the last world
+    last: int,  # number after the last world
     book: BorderRecords,  # output: vehicles near a border
 ) -> None:
     """Renew all ghosts of some worlds from the owned rows, and record vehicles near a border.

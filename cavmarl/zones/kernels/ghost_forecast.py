@@ -58,7 +58,7 @@ def write_forecast(
     forecast: Forecast,
     before: Floats,  # the row one tick ago, with its step
     before_words: Words,  # the same memory
-    row: Floats,  # the present row; a word of the forecast is read only after it is written
+    row: Floats,  # the current row; a word of the forecast is read only after it is written
     row_words: Words,  # the same memory
     known: np.uint64,  # one bit per word; words with the bit 1 are not written
     found: Floats,  # output: a copy of the row one tick ago, or `row` itself

@@ -12,7 +12,7 @@ from cavmarl.zones.kernels.visibility_scratch import VisibilityScratch
 
 @inlined_kernel
 def _num_next(roads: RoadArrays, lane: int, forwards: bool) -> int:
-    """Return the number of lanes that follow a lane (forwards), or that lead to it (backwards)."""
+    """Return the number of lanes that follow a lane (forwards) or precede it (backwards)."""
     row = roads.lanes[lane]
     if not forwards:
         return int(row["num_into"])
@@ -51,7 +51,7 @@ def extend_paths(
     ways: NDArray[np.float64],
     scratch: VisibilityScratch,  # `waits` and `following` are used
 ) -> None:
-    """Extend paths along the roads to all lanes within a limit, and write their least lengths."""
+    """Extend the shortest paths along roads to all lanes within a limit; write their lengths."""
     head = -1
     tail = -1
     for lane in range(ways.size):

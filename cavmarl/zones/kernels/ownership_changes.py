@@ -1,6 +1,6 @@
 """Approaches to borders, and changes of owner, if one process has all zones.
 
-`BorderRecords` stores both. Vehicles near a border are recorded at the end of a tick, together with
+`BorderRecords` stores them. Vehicles near a border are recorded at the end of a tick, together with
 the exchange of ghosts. In most ticks no vehicle has crossed, so the next tick has nothing to do.
 """
 
@@ -25,7 +25,7 @@ COMING = np.dtype(
     [
         ("vehicle", np.int64),
         ("target", np.int64),  # zone that the vehicle approaches
-        ("epoch", np.int64),  # epoch of the present ownership
+        ("epoch", np.int64),  # epoch of the current ownership
         ("tick", np.int64),  # first tick in which the vehicle was near
         ("depth_m", np.float64),  # distance outside of its owner's zone in that tick, see NEAR
         ("ms", np.float64),  # clock time of that tick
@@ -42,9 +42,9 @@ CHANGE = np.dtype(
         ("epoch", np.int64),  # epoch of the new ownership
         ("place", np.int64),  # the vehicle's row at the target
         ("approached", np.int64),  # first tick in which the vehicle was near
-        ("prepare_depth_m", np.float64),  # distance outside of the source's zone in that tick,
-        ("switch_depth_m", np.float64),  # at the change of owner,
-        ("release_depth_m", np.float64),  # and one tick later; NaN: the vehicle has left the world
+        ("prepare_depth_m", np.float64),  # distance outside of the source's zone in that tick
+        ("switch_depth_m", np.float64),  # the same distance at the change of owner
+        ("release_depth_m", np.float64),  # the same one tick later; NaN: the vehicle has left
         # duration since the first approach; until the tick ends, clock time of the first approach
         ("ms", np.float64),
     ],
@@ -64,7 +64,7 @@ DUE = np.dtype(
 """A row that must be copied to a zone as a ghost."""
 
 BATCH_SIZE = 512
-"""Size of a batch of rows to copy; larger than the greatest number of zones."""
+"""Size of a batch of rows to copy; larger than the largest number of zones."""
 
 UNREAD_LIMIT = 256
 """As soon as this many changes are unread, they are read. A tick adds at most one per vehicle."""
@@ -77,10 +77,10 @@ class BorderRecords(NamedTuple):
     num_near: NDArray[np.int64]  # (W,) number of entries of `near`
     num_crossed: NDArray[np.int64]  # (W,) number of vehicles in `near` that have crossed
     owned: NDArray[np.int64]  # (W,) number of vehicles when `near` was made
-    coming: NDArray[np.void]  # COMING (W, 2, 2 C) near and not crossed; two lists that take turns
-    turn: NDArray[np.int64]  # (W,) index of the present list; the other is the previous tick's
+    coming: NDArray[np.void]  # COMING (W, 2, 2 C) near and not crossed; two alternating lists
+    turn: NDArray[np.int64]  # (W,) index of the current list; the other is the previous tick's
     num_coming: NDArray[np.int64]  # (W, 2) number of entries of both lists
-    known: NDArray[np.int64]  # (W,) entries of the present list that were in the previous list
+    known: NDArray[np.int64]  # (W,) entries of the current list that were in the previous list
     acknowledged: NDArray[np.int64]  # (W,) sum of the entries of `coming` in all earlier ticks
     aborted: NDArray[np.int64]  # (W,) number of vehicles that have turned away or left
     tick: NDArray[np.int64]  # (W,) tick of the rows in which `near` was found
@@ -172,8 +172,8 @@ def hand_over(
     """Give every vehicle beyond its zone's hysteresis to the zone that contains it.
 
     Returns:
-        The number of changes, which are at the end of `book.changes` by rising ids. If a change
-        fails: NOT_OWNED or NOT_SEEN, and the failed change follows the other changes.
+        The number of changes, which are at the end of `book.changes` in ascending order of ids. If
+        a change fails: NOT_OWNED or NOT_SEEN, and the failed change follows the other changes.
     """
     if check_all:
         look(zones, borders, zoned, side, w, True, num_newborn, book)
@@ -199,7 +199,7 @@ def _follow_swap(
 ) -> None:
     """Update the row of a vehicle that has moved into the row of a vehicle that left its zone.
 
-    Both have changed their zone in this tick. Without this, `release` would search all rows.
+    Both vehicles left their zone in this tick. Without the update, `release` would search all rows.
     """
     last = zoned.num_owned[near["source"], w]
     newest = book.num_changes[w] - 1
@@ -219,7 +219,7 @@ def _is_newborn(book: BorderRecords, w: int, num_newborn: int, vehicle: int) -> 
 
 @inlined_kernel
 def _renew(zoned: ZoneState, side: int, w: int, book: BorderRecords) -> None:
-    """Write the present list in `coming`; vehicles of the previous list keep their approach."""
+    """Write the current list in `coming`; vehicles of the previous list keep their approach."""
     turn = book.turn[w]
     before = book.coming[w, 1 - turn]
     now = book.coming[w, turn]
@@ -258,7 +258,7 @@ def _place_of(coming: NDArray[np.void], num: int, vehicle: int, target: int, epo
 
 @inlined_kernel
 def _next_crossed(near: NDArray[np.void], num: int, last: int) -> int:
-    """Return the entry of the crossed vehicle with the least id above `last`, or -1."""
+    """Return the entry of the crossed vehicle with the smallest id above `last`, or -1."""
     best = -1
     for n in range(num):
         entry = near[n]

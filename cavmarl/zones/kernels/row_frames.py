@@ -50,7 +50,7 @@ class ExchangeState(NamedTuple):
     num_near: NDArray[np.int64]  # (k, W)
     mine: NDArray[np.int64]  # zones of this process
     theirs: NDArray[np.int64]  # zones of the other process
-    running: NDArray[np.int64]  # (W,) output: vehicles of this process and of frames so far
+    running: NDArray[np.int64]  # (W,) output: vehicles of this process and of the frames read
     rerouted: NDArray[np.int64]  # (W,) output: changes of route up to the last frame
 
 

@@ -227,7 +227,7 @@ def _find_lines(roads: RoadArrays, see_m: float, half_m: float, scratch: Visibil
                     scratch.foe[sweep["foe"]] = True
                     scratch.swept[sweep["foe"]] = True
     grown = True
-    while grown:  # on equal roads, vehicles may yield in a cycle, which drivers look for
+    while grown:  # on equal roads, drivers search for cycles of vehicles that must yield
         grown = False
         for link in range(roads.links.shape[0]):
             if not (scratch.foe[link] and on_equal_road(roads, link)):

@@ -6,7 +6,7 @@ cuts find the cell of a position. They only compare the coordinates with stored 
 processes agree, even for positions on a border.
 
 Ghosts depend on a vehicle's position: a zone receives a ghost of the vehicle if the vehicle is
-within the zone's halo and a driver of the zone may consider it, even if the zone does not touch the
+within the zone's halo and a driver of the zone may consider it. The zone need not touch the
 vehicle's own zone (decision 012).
 """
 
@@ -29,8 +29,8 @@ from cavmarl.driving.kernels.junctions.stop_line_registration import (
 class ZoneArrays(NamedTuple):
     """The arrays of a `ZonePartition` of k zones, for kernels."""
 
-    cuts_x: NDArray[np.float64]  # (columns - 1,) rising, m
-    cuts_y: NDArray[np.float64]  # (rows - 1,) rising, m
+    cuts_x: NDArray[np.float64]  # (columns - 1,) ascending, m
+    cuts_y: NDArray[np.float64]  # (rows - 1,) ascending, m
     cells: NDArray[np.int32]  # (rows, columns) the zone of each cell
     rects: NDArray[np.float64]  # (k, 4) min_x, min_y, max_x, max_y; infinite at the rim
 
@@ -39,9 +39,9 @@ LOOK = np.dtype([(name, np.float32) for name in ("head", "tail", "back", "line",
 """The vehicles on a lane that a zone's drivers may consider (`kernels.visibility_tests`), by their
 position in m along the lane: vehicles up to `head`, vehicles beyond `tail`, and vehicles within
 their registration distance of one of three places. These are `back`, the position of a vehicle that
-they may follow; `line`, a stop line, except for vehicles that may be ignored before it; and `room`,
-a stop line before which no vehicle may be ignored. Moving vehicles are also considered within
-`MERGES_M` of `merge`, a line at which other vehicles turn into their lane."""
+drivers may follow; `line`, a stop line, except for vehicles that may be ignored before the line;
+and `room`, a stop line before which no vehicle may be ignored. Moving vehicles are also considered
+within `MERGES_M` of `merge`, a line at which other vehicles turn into their lane."""
 
 WATCH = np.dtype([("zone", np.int32), *((name, LOOK[name]) for name in LOOK.names or ())])
 """A LOOK and its zone."""

@@ -18,7 +18,7 @@ Floats = NDArray[np.float64]
 
 
 def imbalance(values: Sequence[float]) -> float:
-    """Return maximum / mean of k values: 1 if all are equal (even 0), k if only one is not 0.
+    """Return maximum / mean of k values: 1 if all are equal (even 0), k if only one value is not 0.
 
     With one worker per zone, the slowest worker sets the pace: the imbalance is the ratio of its
     time to the time with a perfect division.

@@ -206,7 +206,7 @@ def test_a_server_with_another_map_is_refused(monkeypatch: pytest.MonkeyPatch) -
             agents=2,
             background=4,
         )
-        with pytest.raises(ZoneSimulatorError, match="its map Carla/Maps/grid4x4 is another one"):
+        with pytest.raises(ZoneSimulatorError, match="its map Carla/Maps/grid4x4 is wrong"):
             vec.reset()
         vec.close()
 

@@ -27,7 +27,7 @@ def fake_python(folder: Path, command: str) -> str:
         ("kill -9 $$", r"its client has ended \(exit code -9\)"),
         (
             """read line; echo '{"error": "ModuleNotFoundError: No module named '"'carla'"'"}'""",
-            "install the package carla, or let CAVMARL_CARLA_PYTHON name a Python",
+            "install the package carla, or set CAVMARL_CARLA_PYTHON to a Python",
         ),
         ("read line; echo 'libcarla: hello'", "its client has sent"),
         ("exec sleep 60", r"its client has not answered in time \(timeout_s = 0.2\)"),
