@@ -120,8 +120,11 @@ def test_a_job_resumes_only_its_own_run(here: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["ppo", "--to", "service"], "--to service: the service evaluates drivers, but trains no"),
-        (["ppo", "--to", "pbs"], "--to pbs: unknown; give slurm, ray or local"),
+        (["ppo_sb3", "--to", "service"], "--to service: nodes of a service train with ppo only"),
+        (["ppo", "--to", "service", "--workers", "2"], "--workers: has no effect with --to serv"),
+        (["ppo", "--to", "service", "--import", "os"], "--import: has no effect with --to serv"),
+        (["ppo", "--to", "service", "--gpus", "1"], "--gpus: has no effect with --to service"),
+        (["ppo", "--to", "pbs"], "--to pbs: unknown; give slurm, ray, service or local"),
         (["ppo", "--sbatch", "a=b", "--to", "local"], "--sbatch: has no effect with --to local"),
         (["ppo", "--to", "ray", "--job-minutes", "9"], "--job-minutes: has no effect with"),
         (["ppo", "--sbatch", "gpu"], "--sbatch gpu: must be KEY=VALUE"),
@@ -134,8 +137,9 @@ def test_a_job_resumes_only_its_own_run(here: Path) -> None:
     ],
 )
 def test_jobs_with_invalid_arguments_are_refused_before_they_are_queued(
-    here: Path, words: list[str], said: str
+    here: Path, words: list[str], said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("CAVMARL_SECRET", "secret")
     assert said in refusal(ConfigError, *words)
     assert not list(here.iterdir())
 

@@ -21,7 +21,7 @@ QUICK = {
     "1 vehicle, 2 zones, 4 ticks, old offers": Small(ticks=4, window=1),
     "1 vehicle, 2 zones, a host dies, 3 ticks": Small(ticks=3, crashes=1, turns_away=False),
     "1 vehicle, 2 zones, a zombie, 3 ticks": Small(ticks=3, false_alarms=1),
-    "1 vehicle, 2 zones, everybody dies": Small(
+    "1 vehicle, 2 zones, every process dies": Small(
         crashes=1, false_alarms=1, coordinator_crashes=1, turns_away=False
     ),
     "1 vehicle, 2 zones, two hosts die": Small(crashes=2),
