@@ -123,16 +123,22 @@ def check_policies(policies: list[str], files: Mapping[str, Any] | None = None) 
             )
 
 
-def world_of(document: dict[str, Any], folder: str) -> tuple[str, dict[str, Any]]:
+def world_of(
+    document: dict[str, Any], folder: str, seen_as: str = ""
+) -> tuple[str, dict[str, Any]]:
     """Return the environment and the keywords of `make_vec` and `evaluate` for a world.
 
-    `folder`: the folder with the files of the configuration.
+    Args:
+        document: the configuration.
+        folder: the folder with its files.
+        seen_as: path of that folder for the process that makes the world; empty: `folder`.
     """
-    files = document.get("files", {})
-    environment = environment_of(document["environment"], files, folder)
+    files, name = document.get("files", {}), document["environment"]
     keys = world_keywords(document)
-    keys["overrides"] |= placed_overrides(environment, keys, files, folder)
-    return environment, keys
+    environment = environment_of(name, files, folder)
+    seen_as = seen_as or folder
+    keys["overrides"] |= placed_overrides(environment, keys, files, seen_as)
+    return environment_of(name, files, seen_as), keys
 
 
 def world_keywords(document: dict[str, Any]) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from typing import Any
 
 from cavmarl.client.service_protocol import plain_name
 from cavmarl.config.registry import programs
-from cavmarl.core.errors import TrainingError
+from cavmarl.core.errors import ServiceError, TrainingError
 from cavmarl.core.processes import start_dying_with_process
 from cavmarl.evaluate.provenance.training_record import CHECKPOINT_FILE, is_trained
 from cavmarl.service.error_names import problem
@@ -64,7 +64,7 @@ async def train(
         return True
     run.parent.mkdir(exist_ok=True)
     messages = run.parent / "messages.txt"
-    options = program_options(document, job["settings"])
+    options = program_options(document, job["settings"], work)
     if (run / CHECKPOINT_FILE).exists():
         options = ["--resume", str(RUN)]
     command = [sys.executable, str(programs()[PROGRAM]), *options]
@@ -129,7 +129,9 @@ def unpack_run(content: bytes, run: Path) -> None:
             if (size := sum(one.file_size for one in files)) > MOST_RUN_BYTES:
                 raise problem("damaged", f"the run has {size} bytes: at most {MOST_RUN_BYTES}")
             named = {plain_name(one.filename): archive.read(one) for one in files}
-    except (zipfile.BadZipFile, EOFError, ValueError, OSError, NotImplementedError) as error:
+    except ServiceError:
+        raise
+    except Exception as error:  # zipfile raises errors of many types
         raise problem("damaged", f"the state of the run cannot be read: {error}") from error
     run.mkdir(parents=True)
     for name, file in named.items():

@@ -65,12 +65,12 @@ def check_training(document: Mapping[str, Any], settings: Settings) -> None:
             check_policies(_names(value), document.get("files"))
 
 
-def program_options(document: Mapping[str, Any], settings: Settings) -> list[str]:
+def program_options(document: Mapping[str, Any], settings: Settings, work: Path) -> list[str]:
     """Return the options of the program; paths are relative to its working directory.
 
-    The working directory has the files of the configuration.
+    `work`: the working directory, with the files of the configuration.
     """
-    environment, keys = world_of(dict(document), ".")
+    environment, keys = world_of(dict(document), str(work), ".")
     overrides = keys["overrides"].items()
     given: dict[str, Any] = {
         **settings,

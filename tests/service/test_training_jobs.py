@@ -31,7 +31,7 @@ from tests.support.training import load_program
 
 SETTINGS: dict[str, Any] = {
     "hidden": 8, "num_steps": 32, "epochs": 2, "minibatches": 2, "checkpoint_updates": 20,
-    "total_agent_steps": 200_000,
+    "total_agent_steps": 100_000,
 }  # fmt: skip
 WORLD: dict[str, Any] = {"num_envs": 2, "agents": 2, "background": 2}
 
@@ -114,7 +114,9 @@ def test_a_training_with_own_files_is_submitted_and_fetched_by_commands(
     assert fetched.exit_code == 0, fetched.output
     folder = tmp_path / "runs/mine_ippo_0"
     assert is_trained(folder)
-    assert {"idm", "krauss"} <= set(str(read_closed(folder)["world"]))
+    world = read_closed(folder)["world"]["config"]
+    assert world["traffic"]["model"] == {"idm": 0.5, "krauss": 0.5}
+    assert world["horizon_s"] == 20.0
 
 
 def test_a_training_that_fails_tells_the_message_of_the_program(
@@ -170,7 +172,7 @@ def test_configurations_that_cannot_be_trained_in_are_refused(
 
 def test_the_options_of_the_program_follow_from_the_configuration_and_the_settings() -> None:
     made = document(agents=3, zones=2, num_envs=4, seed=5, overrides={"horizon_s": 9.0})
-    options = program_options(made, {"anneal": False, "hidden": 8, "start": "merge_ippo"})
+    options = program_options(made, {"anneal": False, "hidden": 8, "start": "merge_ippo"}, Path())
     args = load_program("ppo").parse_run(load_program("ppo").Args, options, "")
     assert (args.env, args.agents, args.num_envs, args.seed) == ("ring", 3, 4, 5)
     assert (args.anneal, args.hidden, args.start) == (False, 8, "merge_ippo")
