@@ -76,7 +76,7 @@ def settings_of(kind: type[S], given: Mapping[str, Any]) -> S:
 
 def split_settings(text: str) -> list[str]:
     """Return the parts KEY=VALUE of a comma-separated text; values may be JSON with commas."""
-    return [word for word in re.split(r",(?=[A-Za-z_.]+=)", text.strip(",")) if word]
+    return [word for word in re.split(r",(?=[\w.]+=)", text.strip(",")) if word]
 
 
 def check_at_least(settings: object, least: Mapping[str, float]) -> None:

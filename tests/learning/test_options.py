@@ -15,6 +15,7 @@ from cavmarl.learning.options import (
     parse_settings,
     run_folder,
     run_program,
+    split_settings,
 )
 
 
@@ -88,3 +89,16 @@ def test_a_missing_device_is_refused_with_a_remedy(name: str) -> None:
     check_device("cpu")
     with pytest.raises(ConfigError, match=f"--device {name}: .*give cpu, or cuda"):
         check_device(name)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", []),
+        ("a.b=1", ["a.b=1"]),
+        ("a.b=1,c=x,", ["a.b=1", "c=x"]),
+        ('a={"idm":0.5,"krauss":0.5},b=[1,2]', ['a={"idm":0.5,"krauss":0.5}', "b=[1,2]"]),
+    ],
+)
+def test_settings_are_split_at_commas_before_a_key(text: str, words: list[str]) -> None:
+    assert split_settings(text) == words

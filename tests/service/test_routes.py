@@ -55,6 +55,7 @@ MATRIX: dict[str, set[str] | None] = {
     "GET /v1/artefacts/{sha256}": ALL,
     "DELETE /v1/artefacts/{sha256}": CLIENTS,
     "POST /v1/jobs": CLIENTS,
+    "POST /v1/trainings": CLIENTS,
     "POST /v1/jobs/{number}/outcome": {"node"},
     "GET /v1/jobs/{number}/results/{name}": READERS,
     "PUT /v1/jobs/{number}/results/{name}": {"node"},
