@@ -99,7 +99,7 @@ ONLY_DIVIDED = (
     "zones.journal", "zones.check_invariants", "zones.repartition_steps",
     "workers.balance_steps", "workers.monitor_cpu", "zones.simulators",
 )  # fmt: skip
-OF_THE_CALLER = "the network simulator is in the process of the caller"
+OF_THE_CALLER = "cannot call a network simulator in the process of the caller"
 BY_COSTS = "whole worlds on nodes are balanced by their costs only"
 NOT_OVER_NODES = "not supported over nodes"
 REFUSED = {
