@@ -2,11 +2,12 @@
 
     python carla_client.py PORT TICKS SENSORS OUTPUT
 
-The program needs CARLA's client and nothing of cavmarl. SENSORS and OUTPUT are JSON files. SENSORS
-has a list of blueprints with attributes, which are mounted on the first agent. OUTPUT has the wall
-time of all ticks in s, the largest number of vehicles, and for each sensor the delays of its frames
-in ms. A delay is the time from the call of `tick` to the arrival of the frame of this tick. Frames
-that come out of order have no delay.
+The program needs CARLA's client and nothing of cavmarl. TICKS is the number of measured ticks; 50
+ticks before them are not measured. SENSORS and OUTPUT are JSON files. SENSORS has a list of
+blueprints with attributes, which are mounted on the first agent. OUTPUT has the wall time of the
+measured ticks in s, the largest number of vehicles, and for each sensor the delays of its frames in
+ms. A delay is the time from the call of `tick` to the arrival of the frame of this tick. Frames
+that come out of order are left out.
 """
 
 from __future__ import annotations

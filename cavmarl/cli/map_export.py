@@ -56,7 +56,7 @@ def export(
 ) -> None:
     """Write a map for other programs.
 
-    If a written file differs when it is read back, exit with 1.
+    If the OpenDRIVE file differs from the map when it is read back, exit with 1.
     """
     if autoware is not None:
         if lanelet2 is not None:
@@ -108,7 +108,7 @@ def _show(console: Console, target: Path, trip: RoundTrip) -> None:
         console.print(Text(f"{target}: {problem}", style="red"))
     if trip.read.links < trip.map.links or trip.read_off > MOST_OFF:
         words = (
-            "netconvert leaves out lanes that merge into one lane and splits roads at junctions "
-            "when it reads the file; the file itself is complete"
+            "where several lanes lead into one lane, netconvert reads only one of the links; it "
+            "also shortens roads at junctions. The file itself is complete"
         )
         console.print(Text(f"note: {words}", style="yellow"))

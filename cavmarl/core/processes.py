@@ -1,4 +1,4 @@
-"""Child processes that always end with the process that started them.
+"""Child processes; on Linux, they always end with the process that started them.
 
 Ctrl-C in a terminal only interrupts the parent, which then ends its children.
 """
@@ -68,8 +68,8 @@ def die_with_parent() -> None:
 def occupy_standard_descriptors() -> None:
     """Open the null device for each of standard input, output and error that is closed.
 
-    Otherwise a new descriptor gets one of these numbers, and a child process that should inherit
-    the descriptor gets its own standard input instead.
+    Otherwise a file that is opened later gets the number 0, 1 or 2. A child process uses this
+    number for its own standard input, output or error, and cannot inherit the file.
     """
     for number in range(3):
         try:
@@ -79,7 +79,8 @@ def occupy_standard_descriptors() -> None:
             os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
 
 
-# Runs in a new interpreter: with threads, code between fork and exec may hang.
+# Runs in a new interpreter, not as `preexec_fn`: if this process has threads, Python code that runs
+# between fork and exec may hang.
 _WRAPPER = """
 import ctypes, os, resource, signal, sys
 signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -101,7 +102,8 @@ if os.getppid() == int(sys.argv[3]):
 def dying_with_parent(command: Sequence[str], most_bytes: int = 0) -> list[str]:
     """Return a command that runs `command`, a path with arguments, and ends with this process.
 
-    `most_bytes`: memory that the command and its children may each allocate, Linux only; 0: any.
+    On other systems than Linux, return `command`. `most_bytes`: memory that the command and its
+    children may each allocate; 0: any.
     """
     if sys.platform != "linux":
         return list(command)
@@ -110,9 +112,10 @@ def dying_with_parent(command: Sequence[str], most_bytes: int = 0) -> list[str]:
 
 
 def start_dying_with_process(command: Sequence[str], **options: Any) -> subprocess.Popen[Any]:
-    """Start a command that ends with this process, not with the calling thread.
+    """Start a command that ends with this process, not with the calling thread; Linux only.
 
-    The system watches the thread that starts a process, so this is the main or a permanent thread.
+    The system ends a command when the thread that started it ends. Commands are therefore started
+    by the main thread, or by a thread that lasts as long as this process.
     """
 
     def start() -> subprocess.Popen[Any]:

@@ -1,8 +1,9 @@
-"""Baselines for a map: random actions, the built-in driver and a trained driver, and no traffic.
+"""Baselines for a map: three drivers in traffic, and the built-in driver on empty roads.
 
-Three drivers drive the same trips in traffic, under the rules of one environment on another map.
-The built-in driver also drives alone on the road, on other trips of the map. The difference from
-that row estimates the cost of traffic. It is not a bound: another driver can be better.
+Random actions, the built-in driver and a trained driver drive the same trips on the map, in traffic
+and under the rules of the environment `cities`. The built-in driver also drives alone on the map,
+on other trips. The difference between its two results estimates the cost of traffic. The result on
+empty roads is not a bound: another driver can be better.
 """
 
 from __future__ import annotations
@@ -61,13 +62,13 @@ def run_baseline(
         where: a map file, or an environment whose maps are used.
         out: folder of the results; it gets the subfolders `among` and `alone`.
         policy: the trained driver.
-        agents: number of agents in each world; None: as configured by the environment.
-        background: number of background vehicles; None: as configured by the environment.
+        agents: number of agents in each world; None: as configured by `cities`.
+        background: number of background vehicles; None: as configured by `cities`.
         episodes: episodes of each driver in traffic. `idm` alone drives eight times as many, up to
             64.
         seed: seed of the episodes.
         progress: as in `evaluate`.
-        overrides: values of further keys of the environment.
+        overrides: values of other keys of `cities`.
         zones: as in `evaluate`.
         backend: as in `evaluate`.
 

@@ -1,4 +1,4 @@
-"""`RunFolder`: the files of a run, written by one process at a time and never overwritten."""
+"""`RunFolder`: the files of a run. One process writes at a time; no other run overwrites them."""
 
 from __future__ import annotations
 
@@ -52,7 +52,9 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
     class RunSettings(DataclassInstance, Protocol):
-        """Settings of a program; `RunFolder` names the optional ones."""
+        """Settings of a program."""
+
+        # Optional: resume, loggers, checkpoint_updates, total_agent_steps, minutes.
 
         program: ClassVar[str]
 
@@ -182,9 +184,9 @@ class RunFolder:
         return not minutes or self.seconds < 60.0 * minutes
 
     def resume(self) -> Parts:
-        """Return the parts given to `save` and restore all random states; empty: a new run.
+        """Restore all random states, and return the parts of the program's state given to `save`.
 
-        Starts the clock of the run.
+        A new run has no parts. Starts the clock of the run.
         """
         self._began_at = time.perf_counter()
         state = self.began
@@ -204,7 +206,8 @@ class RunFolder:
     def save(self, agent_steps: int, updates: int, parts: Parts) -> None:
         """Replace the checkpoint by a new one; all processes call this.
 
-        A process other than the first resumes with the shared parts, updated by its own `parts`.
+        When a process other than the first resumes, it gets the parts of the first process, except
+        for parts whose name is also in its own `parts`: these are its own.
 
         Raises:
             TrainingError: it cannot be written; the previous one is intact.
@@ -229,9 +232,9 @@ class RunFolder:
             write_checkpoint(self.path, state)
 
     def save_driver(self, network: ActorCritic, config: NetworkConfig) -> None:
-        """Write the current driver for evaluation, with the kinds of the maps of its training.
+        """Write the current driver for evaluation, with the kinds of its training maps.
 
-        A run cannot be resumed from this file.
+        See `roads.road_kinds` for the kinds. A run cannot be resumed from this file.
         """
         if self._ranks.rank:
             return

@@ -1,10 +1,12 @@
 """The messages between coordinator and zone hosts, and the records of the coordinator's log.
 
-A message has its fences: the run, the episode, the tick, and the incarnation of the sending or
-receiving process. Each entry about a vehicle has the vehicle's epoch. States of vehicles are opaque
-bytes with a digest; only the runtime reads them.
+C is the coordinator, Z a zone host, S the source and T the target of a hand-off. A message states
+its run, its episode, its tick, and the incarnation of the sending or receiving host, so that
+outdated messages can be dropped. Each entry about a vehicle has the vehicle's epoch. States of
+vehicles are opaque bytes with a digest; only the runtime (the program around this package) reads
+them. docs/explanation/ownership.md defines all terms.
 
-The rule of the core: **store the records, then send the messages** (`Output`).
+The rule of this package: **store the records, then send the messages** (`Output`).
 
 Messages and records are never changed. Their classes are not frozen, because a frozen instance
 takes 2.4 µs to make instead of 0.4 µs, and an idle tick of four zones makes twenty of them.
@@ -29,9 +31,9 @@ _TO_COORDINATOR = (COORDINATOR,)
 class Refusal(IntEnum):
     """The reason why a target refuses a state."""
 
-    LOAD = 1
-    SCHEMA = 2
-    DIGEST = 3
+    LOAD = 1  # the target has no room for another replica
+    SCHEMA = 2  # the state has another version
+    DIGEST = 3  # the state does not match its digest
     SIMULATOR = 4  # the simulator that runs the zone does not accept the vehicle now
 
 
@@ -128,8 +130,8 @@ class Step(Message):
     enter: tuple[In, ...] = ()
     leave: tuple[Out, ...] = ()
     spawn: tuple[Spawn, ...] = ()
-    owned: OwnedTally = field(default_factory=OwnedTally)
-    payload: bytes = b""
+    owned: OwnedTally = field(default_factory=OwnedTally)  # what the zone owns after these changes
+    payload: bytes = b""  # only the runtime reads it
 
     def destinations(self) -> tuple[int, ...]:
         return (self.zone,)
@@ -137,15 +139,15 @@ class Step(Message):
 
 @dataclass(slots=True, unsafe_hash=True)
 class Done(Message):
-    """Z → C: `tick` is in the store. `owned`: after removals; `rows`: digest of the rows."""
+    """Z → C: the zone has stored its vehicles at `tick`."""
 
     zone: int
     incarnation: int
     confirmed: tuple[Confirmed, ...] = ()
     removed: tuple[Removed, ...] = ()
-    owned: OwnedTally = field(default_factory=OwnedTally)
-    rows: int = 0
-    payload: bytes = b""
+    owned: OwnedTally = field(default_factory=OwnedTally)  # what the zone owns after removals
+    rows: int = 0  # digest of the rows of these vehicles
+    payload: bytes = b""  # only the runtime reads it
 
 
 @dataclass(slots=True, unsafe_hash=True)
@@ -294,7 +296,7 @@ class Fence(Record):
 
 @dataclass(slots=True, unsafe_hash=True)
 class Host(Record):
-    """A new process of `worker` hosts the zone."""
+    """A new host, with this incarnation, runs the zone in the process number `worker`."""
 
     zone: int
     incarnation: int

@@ -103,7 +103,10 @@ def serve(options: ServerOptions, tell: Callable[[str], None]) -> None:
         if log.failure is not None:
             raise log.failure
         if log.is_broken:
-            raise ServiceError(f"store {store.where}: could not be written; the log has the reason")
+            raise ServiceError(
+                f"store {store.where}: could not be written, or its connection was lost; see the "
+                "error above, if there is one, and start the service again"
+            )
         log.end()
     finally:
         listener.close()
@@ -136,8 +139,8 @@ def follow_store(
     """Return the log of a store as soon as no other service has the store.
 
     Until then, the log is read as the other service writes it. So taking over takes the same time
-    for a log of any length. When the records are complete, `tell` is called; then the events before
-    the snapshot are checked.
+    for a log of any length. `tell` is called once the existing events are read. The events before
+    the newest snapshot are checked after that, between the reads.
 
     Raises:
         ServiceError: the server of the store does not answer, or the log was modified.

@@ -23,7 +23,7 @@ from cavmarl.v2x.kernels.v2x_records import REPORT
 def learned_drivers(
     config: EnvConfig,
     network: RoadNetwork,
-    plans: NDArray[np.void],  # PLAN (G, L)
+    plans: NDArray[np.void],  # PLAN (goals, lanes)
     capacity: int,  # rows per world
 ) -> tuple[LearnedDriver, ...]:
     """Return the networks that `traffic.model` names, ordered as `TrafficConfig.models`.

@@ -1,7 +1,8 @@
 """Controllers of signals, which choose greens from what agents know about the lanes.
 
 Each controller is for W worlds and is stateless: the history of lanes is part of the worlds' state.
-Choices that the mask excludes are replaced by the current green.
+A choice that the mask excludes is replaced by the current green, or by the next green if the mask
+also excludes the current one.
 """
 
 from __future__ import annotations
@@ -31,14 +32,15 @@ class SignalView(NamedTuple):
         table: greens, lanes and movements of S signals.
         observations: (W, S, D), the agents' observations.
         ticks: (W,) since the reset.
-        counts: (W, N, COUNTS) counts of the watched lanes, by the sensors of `signals.sensing`; see
-            `signals.kernels.lane_counts`.
-        states: (W, S, HELD) states of the signals; see `signals.kernels.green_choices`.
+        counts: (W, N, COUNTS) counts of the watched lanes, by the sensors that the key
+            `signals.sensing` selects; see `cavmarl.signals.kernels.lane_counts`.
+        states: (W, S, HELD) states of the signals; see `cavmarl.signals.kernels.green_choices`.
         masks: (W, S, G) allowed choices.
         decides: (W,) whether it is time for a decision.
-        history: (W, N, HISTORY) history of the watched lanes; see `signals.kernels.lane_history`.
-        loops: (W, N, 2, READINGS) readings of induction loops, see `signals.kernels.loop_counts`;
-            without loops, (W, 0, 2, READINGS).
+        history: (W, N, HISTORY) history of the watched lanes; see
+            `cavmarl.signals.kernels.lane_history`.
+        loops: (W, N, 2, READINGS) readings of induction loops, see
+            `cavmarl.signals.kernels.loop_counts`; without loops, (W, 0, 2, READINGS).
     """
 
     config: SignalsConfig
@@ -154,7 +156,7 @@ class MaxPressure:
     """
 
     def choose(self, view: SignalView) -> NDArray[np.int64]:
-        """Choose the green whose movements have the most vehicles before and the fewest behind."""
+        """Choose the green with the most vehicles on incoming and the fewest on outgoing lanes."""
         return _best(view, view.table.pressure)
 
 
@@ -204,9 +206,10 @@ def _best(view: SignalView, weights: LaneWeights) -> NDArray[np.int64]:
 def _by_durations(
     view: SignalView, green_s: NDArray[np.float64], early_s: float
 ) -> NDArray[np.int64]:
-    """Start the next green if the current green has lasted for its duration (W or 1, S, G).
+    """Start the next green if the current green has lasted for its duration.
 
-    `early_s`: how long before the end of the duration the next green may start.
+    `green_s`: (W, S, G) durations. `early_s`: how long before the end of the duration the next
+    green may start.
     """
     green = view.states[..., GREEN]
     change_s = view.config.yellow_s + view.config.all_red_s

@@ -310,7 +310,8 @@ def test_the_number_of_points_of_a_lane_is_limited(
     path = crossing()
     monkeypatch.setenv("CAVMARL_MAX_LANE_POINTS", "1")
     with pytest.raises(
-        MapError, match=r"line \d+: <lane .* points, more than 1 \(CAVMARL_MAX_LANE"
+        MapError,
+        match=r"line \d+: <lane .* points, more than 1 \(environment variable CAVMARL_MAX_LANE",
     ):
         read_network(path)
     monkeypatch.setenv("CAVMARL_MAX_LANE_POINTS", "none")
@@ -347,7 +348,8 @@ def test_the_length_of_a_path_over_a_junction_is_limited(
         read_network(far)
     monkeypatch.setenv("CAVMARL_MAX_CROSSING_M", "1")
     with pytest.raises(
-        MapError, match=r"more than 1 \(CAVMARL_MAX_CROSSING_M\): repair the shapes"
+        MapError,
+        match=r"more than 1 \(environment variable CAVMARL_MAX_CROSSING_M\): repair the shapes",
     ):
         read_network(crossing())
 

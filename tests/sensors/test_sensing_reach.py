@@ -56,7 +56,7 @@ ON: dict[str, dict[str, Any]] = {
     "history": {"sensors.history.steps": 2},
 }
 BLIND = {"route", "signal", "way", "history"}  # these sensors observe no vehicle
-# This sensor observes an inbox. The bus fills inboxes from any distance (see tests/v2x).
+# This sensor observes an inbox. The message bus fills inboxes from any distance (see tests/v2x).
 TOLD = {"messages"}
 
 
@@ -146,7 +146,9 @@ def test_a_crowd_beyond_the_reach_changes_nothing(env: str, sensor: str, seed: i
 
 
 @pytest.mark.parametrize("sensor", sorted(set(ON) - BLIND))
-def test_a_vehicle_up_to_half_a_metre_within_the_declared_reach_is_observed(sensor: str) -> None:
+def test_the_farthest_observed_vehicle_is_at_most_half_a_metre_within_the_reach(
+    sensor: str,
+) -> None:
     env = "grid4x4"
     simulation = world(env, sensor)
     agent = agent_of(simulation)

@@ -71,7 +71,7 @@ def test_messages_and_channel_effects_are_off_by_default() -> None:
     assert (channel.path_loss_exponent, channel.building_db, channel.data_rate_mbps) == (0, 0, 0)
 
 
-def test_the_observation_mode_messages_has_other_vehicles_only_from_messages() -> None:
+def test_in_the_mode_messages_other_vehicles_are_known_only_from_messages() -> None:
     overrides = {
         "v2x.enabled": True, "sensors.messages.objects": 3, "sensors.messages.events": 1,
         "sensors.messages.signal": True, "observation.mode": "messages", "observation.kind": "dict",

@@ -1,4 +1,4 @@
-"""The page in a real browser: drawing, requests, no other hosts, and names as text."""
+"""The page in a real browser: it draws, uses no other host, and shows markup in names as text."""
 
 from __future__ import annotations
 
@@ -184,7 +184,7 @@ def test_the_page_draws_the_sensors_and_the_route_of_a_vehicle(browser: Any, ser
     drawn = """(() => { const c = document.querySelector('#labels');
         const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;
         let n = 0; for (let k = 3; k < d.length; k += 4) n += d[k] > 0; return n; })()"""
-    until(page, f"{drawn} > 20000")  # the camera's cone has more pixels
+    until(page, f"{drawn} > 20000")  # labels have fewer pixels, the camera's cone has more
     page.uncheck("#sensors")
     until(page, "viewer.shapes && viewer.shapes.all.length === 0")
     until(page, f"{drawn} < 20000 && {drawn} > 0")

@@ -1,4 +1,4 @@
-"""Reach: how far drivers look, and how far vehicles move in a tick or are off their lanes."""
+"""Reach of drivers, longest move of a vehicle in a tick, and largest distance from its lane."""
 
 from __future__ import annotations
 
@@ -62,12 +62,12 @@ def widest_junction_m(roads: RoadNetwork) -> float:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_reach_includes_view_junctions_and_approaching_vehicles(name: str) -> None:
+def test_reach_includes_the_view_and_junctions_and_approaching_vehicles(name: str) -> None:
     roads = network(name)
     reach_m = driving_reach_m(roads, travel(name))
     rest_m = reach_m - VIEW_M - APPROACH_M - 2.0 * LENGTH_M - ASIDE_M
     assert widest_junction_m(roads) <= rest_m + 1e-9
-    assert rest_m <= 40.0, "the halo covers the whole map"
+    assert rest_m <= 40.0, "the part of the reach for junctions is above 40 m"
 
 
 def test_reach_shrinks_if_drivers_check_stop_lines_from_a_shorter_distance() -> None:
@@ -91,6 +91,8 @@ def test_reach_includes_jumps_over_junctions_without_lanes(tmp_path: Path) -> No
     path.write_text(GAP, encoding="utf-8")
     roads = load_network(find_map(path))
     reach_m = driving_reach_m(roads, travel("merge"))
+    # A road of 40 m and a jump of 20 m: up to 1.5 m of ground per metre of lane. Two of the three
+    # jumps are at the ends of the reach, the third is the distance from the lane's end to its exit.
     stretched = 1.5 * (VIEW_M + APPROACH_M) + 3.0 * 20.0
     assert reach_m == pytest.approx(stretched + 2.0 * LENGTH_M + ASIDE_M)
 

@@ -1,4 +1,7 @@
-"""The parts of lanes that drivers of a zone look at, compared with a slow twin."""
+"""The parts of lanes that drivers of a zone look at, compared with a slow twin (`Looks`).
+
+A twin is a second, simple implementation that tests positions on lanes one by one.
+"""
 
 from __future__ import annotations
 
@@ -79,7 +82,8 @@ def same_looks(found: NDArray[np.void], twin: Looks) -> None:
 def test_the_kernel_equals_its_twin(
     name: str, part: tuple[float, float, float, float], half_m: float, steered: bool
 ) -> None:
-    # Steered maps come from a cache: computing the paths takes minutes without the compiler.
+    # Steered maps have the areas that steered cars sweep. They come from a cache, because computing
+    # these areas takes minutes without the compiler.
     roads = load_steered(find_map(name)) if steered else network(name)
     min_x, min_y, max_x, max_y = roads.extent_m
     low, high = np.array([min_x, min_y] * 2), np.array([max_x, max_y] * 2)
@@ -87,7 +91,7 @@ def test_the_kernel_equals_its_twin(
     found, twin = looks_of(roads, rect, half_m), Looks(roads, rect, VIEW_M, SEE_M, half_m)
     same_looks(found, twin)
     assert np.isfinite(found["line"]).any() == (name == "grid4x4")
-    # On this map, only long vehicles and steered cars sweep over adjacent paths.
+    # On grid4x4, only long vehicles and steered cars sweep over adjacent paths; on merge, none do.
     sweeps = name == "grid4x4" and (half_m == HALF_M or steered)
     assert np.isfinite(found["room"]).any() == sweeps
 
@@ -116,13 +120,18 @@ def test_merging_drivers_see_vehicles_before_the_previous_junction(
 def test_drivers_on_equal_roads_see_the_vehicles_to_which_their_foe_yields(
     tmp_path: Path, junctions: str, seen: int
 ) -> None:
-    """To find a deadlock, a driver looks at the foe and at the vehicles to which the foe yields."""
+    """On roads without priority, a driver looks for deadlocks.
+
+    It looks at the vehicle on a conflicting path (the foe), and at the vehicles to which that
+    vehicle yields.
+    """
     roads = read_network(netgenerate(tmp_path / "net.net.xml", "-g", "-j", junctions))
     links, conflicts = roads.links.copy(), roads.conflicts.copy()
     middle = np.bincount(links["junction"]).argmax()
     one, other, *rest = ends = np.unique(links["from_lane"][links["junction"] == middle])
     assert len(rest) == 2
-    # Let the links from `one` yield only to the link from `other` that yields to the most links.
+    # Links from `one` now yield to a single link: of the links from `other`, the one that itself
+    # yields to the most links.
     owner = np.repeat(np.arange(len(links)), links["num_conflicts"])
     yields = np.bincount(owner[conflicts["must_yield"]], minlength=len(links))
     conflicts["foe"][links["from_lane"][owner] == one] = np.argmax(
@@ -143,7 +152,11 @@ def test_drivers_on_equal_roads_see_the_vehicles_to_which_their_foe_yields(
 def test_vehicles_past_a_shorter_lane_are_seen_from_the_longer_lane(
     tmp_path: Path, from_line_m: float
 ) -> None:
-    """The zone is beyond the junction (-40 m), or before it; at 120 m it is too far away."""
+    """Two lanes of a road end at different places before the same junction.
+
+    `from_line_m`: distance of the zone before the stop line. At -40, the zone is beyond the
+    junction; at 120, it is too far away.
+    """
     path = build_crossing(tmp_path, "priority", side_lanes=2)
     roads = read_network(with_shorter_lane(path, "S_in_1", 8.0))
     turn = roads.lane_ids.index(":c_10_0")
@@ -176,7 +189,7 @@ def test_drivers_look_farther_ahead_than_back(line: RoadNetwork) -> None:
 
 
 def test_a_follower_across_a_border_is_seen(line: RoadNetwork) -> None:
-    """The zone begins 50 m after the end of the first road, where a follower may be."""
+    """The zone begins 50 m after the end of the first road; a follower may be on that road."""
     before, own, beyond = looks_of(line, (450.0, -10.0, 460.0, 10.0))
     assert before["tail"] == np.inf
     assert before["back"] == pytest.approx(400.0 + 50.0 - ASIDE_M - ROUNDING_M)
@@ -195,7 +208,7 @@ def test_a_zone_without_roads_sees_no_vehicles(line: RoadNetwork) -> None:
 def test_no_visible_vehicle_is_beyond_the_farthest_distance(
     part: tuple[float, float, float, float],
 ) -> None:
-    """The twin tests closely spaced positions on all lanes."""
+    """The expected distance comes from closely spaced positions on all lanes."""
     roads = network("grid4x4")
     min_x, min_y, max_x, max_y = roads.extent_m
     low, high = np.array([min_x, min_y] * 2), np.array([max_x, max_y] * 2)

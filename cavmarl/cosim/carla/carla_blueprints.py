@@ -43,7 +43,7 @@ class Blueprint:
     size_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def packed(self, number: int, first_kind: int) -> list[Any]:
-        """Return the definition as it is sent; `first_kind`: number of the attribute kind bool."""
+        """Return the definition as it is sent; `first_kind`: code of bool, the first kind."""
         attributes = [
             [
                 one.name,
@@ -282,7 +282,7 @@ _PROPS = {
     "wateringcan": (0.4, 0.2, 0.3),
 }
 _CHILDREN = (9, 10, 11, 12, 13, 14, 48, 49)
-# Programs look these up, but a server refuses to spawn them.
+# Programs look these up, but cavmarl's server refuses to spawn them.
 _OTHER_CAMERAS = (
     "camera.normals",
     "camera.dvs",

@@ -392,7 +392,8 @@ def _link_rows(
             raise MapError(
                 f"the path from lane '{connection.getFromLane().getID()}' to lane "
                 f"'{connection.getToLane().getID()}' is {link['length_m']:.6g} m long over the "
-                f"junction, more than {most_m} ({MOST_CROSSING}): repair the shapes of both lanes"
+                f"junction, more than {most_m} (environment variable {MOST_CROSSING}): repair the "
+                "shapes of both lanes"
             )
         # netconvert splits the path of a link where drivers wait inside the junction.
         link["wait_m"] = lanes["length_m"][chain[0]] if len(chain) > 1 else np.inf

@@ -111,7 +111,9 @@ class _CheckedReader(ContentHandler):
         elif name == "request":
             for key in ("response", "foes"):
                 if not _BITS.fullmatch(attrs[key]):
-                    raise self._error(name, attrs, f"has {key}='{attrs[key]}', must be bits")
+                    raise self._error(
+                        name, attrs, f"has {key}='{attrs[key]}', must be only 0 and 1"
+                    )
 
     def _read_rules(self, name: str, attrs: Mapping[str, str]) -> None:
         """Read the lane rules that sumolib does not read; count rules that are not simulated."""
@@ -182,7 +184,10 @@ class _CheckedReader(ContentHandler):
 
     def _check_size(self, name: str, attrs: Mapping[str, str]) -> None:
         if (count := len(attrs.get("shape", "").split())) > self._most_points:
-            problem = f"has {count} points, more than {self._most_points} ({MOST_POINTS})"
+            problem = (
+                f"has {count} points, more than {self._most_points} "
+                f"(environment variable {MOST_POINTS})"
+            )
             raise self._error(name, attrs, problem)
 
 
@@ -192,7 +197,8 @@ class ParsedNet(NamedTuple):
     net: Any  # a `sumolib.net.Net`
     programs: list[SignalProgram]
     left_hand: bool  # whether the map has left-hand traffic
-    # SUMO's classes that may change left and right, for lanes where not all classes may
+    # lane id → SUMO's vehicle classes that may change to the left, and to the right; without
+    # lanes on which all classes may do both
     changes: dict[str, tuple[list[str], list[str]]]
     stop_offsets_m: dict[str, float]  # distance from stop line to lane end, by edge or lane id
     notes: tuple[str, ...]  # elements that are not simulated, with counts

@@ -24,7 +24,7 @@ Points = NDArray[np.float64]
 _AXIS_M = 6_378_137.0
 _FLATTENING = 1.0 / 298.257223563
 _SQUARED_ECCENTRICITY = _FLATTENING * (2.0 - _FLATTENING)
-_ROUNDS = 6  # fixed-point iterations for the height; each adds at least two digits
+_ROUNDS = 6  # fixed-point iterations for the latitude; each adds at least two digits
 
 
 class Geodesy(Protocol):

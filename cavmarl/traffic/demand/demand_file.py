@@ -62,8 +62,8 @@ class DemandFile:
     element_ids: tuple[str, ...]  # ids of vehicles, trips and flows
     type_choices: Choices  # lists of VTYPE rows with probabilities
     route_choices: Choices  # lists of ROUTE rows with probabilities
-    # sorted keys type * num_routes + route of vehicles that cannot drive their route; empty unless
-    # such vehicles are skipped
+    # pairs of a type and a route that it cannot drive, as sorted numbers type * num_routes + route;
+    # empty unless vehicles that cannot drive their route are skipped
     bad_pairs: NDArray[np.int64]
     rerouters: Rerouters  # rules that reroute vehicles on certain edges
     device: DeviceOptions  # options of the rerouting device for all vehicles
@@ -107,7 +107,7 @@ class DemandFile:
         return digest.hexdigest()
 
     def draw(self, key: int, until_s: float | None = None) -> NDArray[np.void]:
-        """Draw the orders of one episode, a pure function of the key.
+        """Draw the departures of one episode (ORDER rows), a pure function of the key.
 
         `key`: random key of the world and episode, see `math.rng.world_key`. `until_s`: no vehicle
         departs at or after this time; None: the end of the files' simulation.
@@ -171,7 +171,7 @@ class DemandFile:
         return choices.pick(self.elements[field][rows], chances(key, rows, numbers, stream))
 
     def vehicle_id(self, order: np.void) -> str:
-        """Return SUMO's name of the vehicle of an ORDER ()."""
+        """Return SUMO's name of the vehicle of one ORDER row."""
         row = int(order["element"])
         name = self.element_ids[row]
         numbered = self.elements[row]["flow"] or order["number"] > 0
@@ -187,11 +187,11 @@ class DemandFile:
         return tuple(self.report.lines())
 
     def begun(self, horizon_s: float) -> DemandFile:
-        """Return this demand with a begin from which vehicles depart within an episode.
+        """Return this demand, with a later begin if no vehicle departs within an episode.
 
         If the files state no begin, and no vehicle departs in the first `horizon_s`, the demand
-        begins in the second of its first departure. The report states this, and also if no vehicle
-        departs within an episode.
+        begins at its first departure, rounded down to whole seconds. The report states this, and
+        also if no vehicle departs within an episode.
         """
         if self._departs_within(horizon_s):
             return self
@@ -256,7 +256,8 @@ def read_demand(
         on_bad_route: how to handle vehicles whose class cannot drive their route, and stops off the
             route: 'error' refuses the file, 'skip' leaves them out and counts them.
         max_departures: maximum number of vehicles.
-        programs: files whose signal programs are read elsewhere, so that they are not counted.
+        programs: files whose signal programs are read elsewhere, so that the report does not count
+            these programs as left out.
 
     Raises:
         DemandError: files are missing, broken, contradictory, or made for another map.

@@ -39,10 +39,11 @@ MAX_DRIFT_RAD = 0.12  # largest angle between a vehicle and its lane during a la
 MAX_SWING_M = 0.3  # largest distance by which the vehicle's corners then swing out
 MAX_BODY_LANES = 8  # lanes that a body can cover, in each direction from its centre
 STANDING_MPS = 0.1
-# A trip ends this far before the end of its goal edge; for a background vehicle, its front counts.
+# A trip ends when the front of a background vehicle, or the centre of an agent's vehicle, is this
+# far before the end of the goal edge.
 ARRIVE_M = 5.0
 MAX_SPEED_MPS = 60.0
-CROSSINGS_PER_TICK = 16  # largest number of lane borders crossed in one tick
+CROSSINGS_PER_TICK = 16  # largest number of lane ends passed in one tick
 
 
 class Before(NamedTuple):
@@ -196,10 +197,10 @@ def _stand(row: np.void, throttle: float, dt: float) -> None:
 def move_background(
     roads: RoadArrays,
     travel: TripTables,
-    row: np.void,  # VEHICLE, the committed record; updated
+    row: np.void,  # VEHICLE before the tick; overwritten with the state after it
     step: np.void,  # PLAN of the vehicle's lane before the tick
     accel: float,  # decided acceleration, m/s²
-    lane_change: int,  # 1 left, -1 right, 0 none, or STAYS_ASIDE
+    lane_change: int,  # 1 left, -1 right, 0 none; STAYS_ASIDE: wait between two lanes
     dt: float,  # length of the tick, s
 ) -> None:
     """Advance a background vehicle by one tick.
@@ -257,9 +258,9 @@ def move_background(
 @kernel
 def move_agent(
     roads: RoadArrays,
-    plans: NDArray[np.void],  # PLAN (G, L)
+    plans: NDArray[np.void],  # PLAN (goals, lanes)
     grid: LaneGrid,  # the lanes near each place
-    row: np.void,  # VEHICLE, the committed record; updated
+    row: np.void,  # VEHICLE before the tick; overwritten with the state after it
     kind: np.void,  # its VTYPE
     throttle: float,  # commanded acceleration, m/s²
     steering: float,  # commanded angle of the front wheels, rad

@@ -159,7 +159,7 @@ def _set_distance_beyond(roads: RoadArrays, row: np.void) -> None:
 @kernel
 def locate(
     roads: RoadArrays,
-    plans: NDArray[np.void],  # PLAN (G, L)
+    plans: NDArray[np.void],  # PLAN (goals, lanes)
     grid: LaneGrid,  # the lanes near each place
     row: np.void,  # VEHICLE with the new x, y and heading and the old lane; updated
 ) -> int:
