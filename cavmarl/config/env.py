@@ -35,18 +35,18 @@ class MapConfig(Section, key="map"):
     """The source of the roads.
 
     Attributes:
-        source: a map file: relative to the entry's folder, absolute, or `sumo:PATH` for a file of
-            the eclipse-sumo wheel. A `.sumocfg` gives its network and signal programs. With a
-            list of map files, or a folder of map files, the seed draws a map for each episode of
+        source: a map file: relative to the environment's folder, absolute, or `sumo:PATH` for a
+            file of the eclipse-sumo wheel. A `.sumocfg` gives its network and signal programs. With
+            a list of map files, or a folder of map files, the seed draws a map for each episode of
             each world.
-        programs: additional files with signal programs, named like `source`. If a signal has
+        programs: additional files with signal programs, with paths as in `source`. If a signal has
             several programs, the last one runs.
         program: the program of each signal named here, instead of the last one; may be `off`.
         buildings: `osm`: the buildings in the OpenStreetMap file `source`; or a file of buildings
-            (OpenStreetMap or SUMO's polygons), named like `source`; empty: none.
+            (OpenStreetMap or SUMO's polygons), with a path as in `source`; empty: none.
         changed_lanes: number of lanes that may differ from the map in a world at the same time:
             closed (`close_road`), or with a lower speed limit (`damage_road`). If it is above 0,
-            each world has its own table of lanes and its own plans.
+            each world needs memory for its own tables of lanes and of routes from all lanes.
         contraflow: ids of roads that can be reversed (`close_road`). The map gets lanes in the
             opposite direction on them, which are closed until the road is reversed. For a reversed
             road, the lanes of both directions count towards `map.changed_lanes`.
@@ -116,8 +116,9 @@ class ObservationConfig:
 
     Attributes:
         mode: `ground_truth`: the features configured under `sensors`, without measurement errors.
-            `sensors`: the latest samples of the `rig`. `messages`: only features under `sensors`
-            that describe the ego vehicle and its route, or are received by radio.
+            `sensors`: the latest samples of the `rig`; keys under `sensors` have no effect.
+            `messages`: only features under `sensors` that describe the ego vehicle and its route,
+            or are received by radio.
         kind: `flat`: one float32 Box. `dict`: one Box per sensor.
     """
 
@@ -130,7 +131,7 @@ class EnvConfig(Section, key=""):
     """The decision process of one environment: all keys of `env.yaml`.
 
     Attributes:
-        name: name of the entry, equal to its folder's.
+        name: name of the environment, equal to the name of its folder.
         version: increases whenever published results change.
         rig: sensors that are mounted on every agent's vehicle, by name; see
             docs/reference/sensors.md.

@@ -26,9 +26,9 @@ class LimitsConfig(Section, key="limits"):
     """Roadside units that set speed limits; docs/reference/limit_agents.md describes the API.
 
     Attributes:
-        units: name of each unit: the edges whose lanes get its limit.
-        sections: name of each section: the edges whose vehicles are counted together. All units
-            know all sections.
+        units: variable speed limits: name of a roadside unit → the edges whose lanes get its limit.
+        sections: name of a section → the edges whose vehicles are counted together. All units know
+            all sections.
         agents: `none`; `all` units; or a list of names of units. Other units set no limit.
         controller: what chooses the limits: `agents` of the environment, or `feedback`; then all
             agents are vehicles.

@@ -35,8 +35,8 @@ class PopulationConfig(Section, key="population"):
             `config.fleet.FleetPart`. It replaces `types`.
         insertions: number of vehicles that may be inserted into a world during an episode
             (`insert_vehicle`); memory is reserved for them.
-        external: number of vehicles that the caller may pose or drive in a world at the same time
-            (`ExternalCommands`); memory is reserved for them.
+        external: number of vehicles in a world at the same time whose position the caller may set,
+            or which the caller drives (`ExternalCommands`); memory is reserved for them.
         external_agents: whether such vehicles can carry the sensors of `rig`; then they are agents
             of a PettingZoo environment while they are in the world: `external_0` and so on.
         reroute: which vehicles take another route if lanes change (`map.changed_lanes`). `never`:

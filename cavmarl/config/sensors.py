@@ -131,8 +131,8 @@ class SignalAheadConfig(
     Attributes:
         enabled: false switches the sensor off.
         range_m: distance ahead up to which it is seen.
-        timing: adds the exact time until the signal changes, from the world's state. A vehicle on a
-            road knows it only from messages (`sensors.messages.timing`).
+        timing: adds the exact time until the signal changes, from the world's state. A real vehicle
+            knows it only from messages (`sensors.messages.timing`).
         stop_signs: how a stop sign is shown. `give_way`: like a yield line; `own`: with an
             additional number for stop signs.
     """
@@ -179,7 +179,7 @@ class KinematicsConfig(
         vehicles_count: number of rows, including the ego vehicle (highway-env: 5); 0 switches the
             sensor off.
         features: columns, from `presence`, `x`, `y`, `vx`, `vy`, `heading`, `cos_h`, `sin_h`,
-            `cos_d`, `sin_d`, `long_off`, `lat_off`, `ang_off`.
+            `cos_d`, `sin_d`, `long_off`, `lat_off`, `ang_off`; see `sensors.observed.highway`.
         features_range: feature to [min, max], mapped to [-1, 1]; other features stay unmapped.
             Empty: x ±200 m, y ±4 m for each lane of the map's widest road, vx and vy ±80 m/s.
         absolute: whether x, y, vx and vy of other vehicles are in the world's frame; otherwise
@@ -325,8 +325,8 @@ class WayConfig(
         distances_m: increasing distances at which the path is sampled; an empty list: none.
         lines: number of next stop lines with a signal or a yield rule; 0: none.
         range_m: distance ahead up to which a line is seen.
-        timing: adds the exact time until a line's signal changes, from the world's state. A vehicle
-            on a road knows it only from messages (`sensors.messages.timing`).
+        timing: adds the exact time until a line's signal changes, from the world's state. A real
+            vehicle knows it only from messages (`sensors.messages.timing`).
         stop_signs: how a stop sign is shown. `give_way`: like a yield line; `own`: with an
             additional number for stop signs; `red`: like a red light, as `tollgate_ippo` needs it.
     """
@@ -362,9 +362,9 @@ class ConflictsConfig(
         range_m: distance up to which vehicles are seen.
         through_walls: false hides vehicles whose centre is behind a wall of `map.buildings`.
         heard: true adds vehicles known only from messages (`v2x`), at extrapolated positions. It
-            also adds two numbers per vehicle, see `seen` and `age`.
+            also adds two features per vehicle: whether it is seen, and the age of the message.
         indicators: true assumes that seen vehicles follow their lanes and the direction that they
-            indicate at their present or next junction; and adds one number per vehicle, see `turn`.
+            indicate at their present or next junction. It also adds this turn as a feature.
         indicators_m: distance to the junction from which vehicles indicate; before that, their turn
             is unknown. 0: they indicate at any distance, as read from the world's state.
     """

@@ -61,7 +61,7 @@ class SignalsConfig(Section, key="signals"):
             an ActionError (`error`).
         range_m: scores of controllers and rewards count the vehicles on lanes that lead to a signal
             within this distance of its stop line; 0: only on the last lane before the signal, as in
-            sumo-rl. Each lane counts in full. Needs `sensing: truth`.
+            sumo-rl. All vehicles on such a lane count, even beyond it. Needs `sensing: truth`.
         terms: weights of the reward's terms; see `SIGNAL_TERMS`.
         sensing: what agents and controllers know of the vehicles: `truth`; the induction `loops` of
             the lanes; what the `camera` of a signal sees; or `v2x`, messages that its roadside unit

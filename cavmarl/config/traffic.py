@@ -20,10 +20,12 @@ class TrafficConfig(Section, key="traffic"):
             routes and signals; cavmarl's drivers drive. `sumo-traffic`: SUMO also moves its
             vehicles. Generated vehicles are added in all three cases.
         demand: SUMO files with vehicles, flows, routes and types (`.rou.xml`, `.add.xml`,
-            `.sumocfg`), named like `map.source`. Their vehicles are added to the generated ones.
+            `.sumocfg`), with paths as in `map.source`. Their vehicles are added to the generated
+            ones.
         on_bad_route: handling of vehicles of the demand that cannot drive their route, and of stops
             off the route: `error`, or `skip` them (counted).
-        goals: number of destination edges of the generator; lane-level plans are made for each.
+        goals: number of destination edges of the generator. For each, the world needs memory for a
+            table of routes from all lanes.
         origins: ids of edges that agents start on; empty: all edges from which a goal is reachable.
         destinations: ids of edges that agents drive to; empty: the generator's goals.
         min_trip_m: shortest route of an agent between origin and destination.

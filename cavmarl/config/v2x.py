@@ -20,7 +20,8 @@ class CamConfig(Section, key="v2x.cam"):
     """Messages of a vehicle about itself, modelled on CAM (ETSI EN 302 637-2).
 
     Attributes:
-        rate_hz: message rate; the phase depends on the vehicle's id. 0: never.
+        rate_hz: rate of a vehicle's messages about itself (CAM); the phase depends on the vehicle's
+            id. 0: never.
         triggered: send a message only if the vehicle has moved 4 m, turned 4° or changed its
             speed by 0.5 m/s since its last message, or if that message is a second old.
     """
@@ -34,7 +35,8 @@ class DenmConfig(Section, key="v2x.denm"):
     """Messages about events, modelled on DENM (ETSI EN 302 637-3).
 
     Attributes:
-        rate_hz: repetition rate while an event lasts; 0: only events that agents declare are sent.
+        rate_hz: rate at which a message about an event (DENM) is repeated while the event lasts;
+            0: only events that agents declare are sent.
         hard_braking_mps2: deceleration from which braking is an event.
         stationary_s: waiting time after which a stopped vehicle is an event.
         validity_s: time for which a receiver keeps an event.
@@ -51,7 +53,7 @@ class PerceptionConfig(Section, key="v2x.perception"):
     """Messages about vehicles that the sender perceives, modelled on CPM (ETSI TS 103 324).
 
     Attributes:
-        rate_hz: rate of messages of a vehicle; 0: never.
+        rate_hz: rate of a vehicle's messages about vehicles that it perceives (CPM); 0: never.
         range_m: range of a vehicle's perception, unless a vehicle or building is in between.
         objects: maximum number of objects in a message; the nearest are kept.
     """
@@ -104,7 +106,8 @@ class ChannelConfig(Section, key="v2x.channel"):
         building_db: loss if a building is in the line of sight; 0: none.
         data_rate_mbps: capacity of the channel; 0: unlimited.
         packet_bytes: length of a packet.
-        external: a network simulator on the bus decides which receiver gets which message.
+        external: a connected network simulator decides which receiver gets which message; see
+            `connect_network` in docs/reference/v2x.md.
     """
 
     range_m: Annotated[float, Within(0.0, 1e6)] = 0.0
@@ -157,7 +160,7 @@ class V2xConfig(Section, key="v2x"):
 
     Attributes:
         enabled: true switches messages on.
-        equipped: share of the background vehicles that send, by id; all agents send.
+        equipped: share of the background vehicles that send, drawn by id; all agents send.
         capacity: packets that can be sent in one tick of a world. Packets of senders with larger
             ids are dropped and counted. 0: no limit.
     """

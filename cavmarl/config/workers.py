@@ -23,12 +23,12 @@ class WorkersConfig(Section, key="workers"):
         balance_steps: steps between two rounds in which worlds, or zones of a divided world, may
             move to another worker, based on their measured cost; 0: they never move. Results do
             not depend on it.
-        imbalance_tolerance: nothing moves while the slowest worker exceeds the time of a perfect
-            division by at most this share.
+        imbalance_tolerance: worlds or zones move only if the slowest worker takes longer than with
+            a perfect division of the work, by more than this share of that time.
         max_moves: maximum number of worlds or zones that move in one round.
         monitor_cpu: measure the load of other programs on the workers' cores, and give no more work
-            to workers whose load is above a threshold; if false, cores are assumed to be free. Zone
-            nodes measure their machines for `balance_steps`.
+            to workers above a threshold of `LoadScore` (docs/explanation/balance.md); if false,
+            cores are assumed to be free. Over zone nodes, true also needs `balance_steps`.
         sensors: processes that compute the sensors of `rig`, for each process that runs worlds;
             0: each process computes its own. Results do not depend on it. See
             docs/guides/sensor_workers.md.

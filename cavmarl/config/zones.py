@@ -17,7 +17,7 @@ class ZonesConfig(Section, key="zones"):
     """The division of the map into zones; see docs/reference/zones.md.
 
     Attributes:
-        layout: division method `grid`, `strips` or `bisection`; or a zone file, named like
+        layout: division method `grid`, `strips` or `bisection`; or a zone file, with a path as in
             `map.source`.
         count: number of zones; with a zone file, the number in the file.
         avoid_junctions: move borders if that keeps junctions in one zone.
@@ -28,14 +28,14 @@ class ZonesConfig(Section, key="zones"):
         backoff_ticks: ticks for which a zone that has refused a vehicle is not asked again.
         halo_m: how far zones see over their borders; default: the minimum for exact results. A
             smaller value is an error.
-        approach_ticks: time, in ticks at the present speed, before the crossing of a border at
-            which a vehicle is announced to the next zone.
+        approach_ticks: a vehicle is announced to the next zone if it would be there after this
+            number of ticks at its present velocity.
         journal: file for the coordinator's log, which must not exist yet; empty: no log.
         check_invariants: check the invariants of ownership at run time.
         repartition_steps: steps between two checks whether bisection by vehicle positions would
             balance the zones better. Results do not depend on it. 0: never.
-        repartition_tolerance: smallest reduction of the fullest zone for which zones change, as a
-            share of the mean.
+        repartition_tolerance: zones change only if that reduces the number of vehicles in the
+            fullest zone by more than this share of the mean number of vehicles per zone.
         simulators: zones that other simulators run, by number: `carla://HOST:PORT`, or the name of
             a registered simulator (docs/guides/zone_simulators.md).
         simulator_failure: if a simulator fails or refuses a vehicle for too long: `error`, or

@@ -132,7 +132,7 @@ class SignalTable:
 def lanes_before(network: RoadNetwork, lane: int, range_m: float) -> list[int]:
     """Return the LANE rows that lead to a lane without a signal in between, nearest first.
 
-    Each starts less than `range_m` before the given lane's end, along the path, and is listed once.
+    The junction after each of them ends less than `range_m` before the given lane's end.
     """
     found: dict[int, None] = {}
     ends = [(lane, 0.0)]
