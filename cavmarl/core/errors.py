@@ -2,7 +2,7 @@
 
     CavmarlError
     ├── ConfigError            an invalid key, value, combination or division
-    │   ├── UnknownEnvironmentError   no entry, path or map has that name
+    │   ├── UnknownEnvironmentError   no environment, folder or map has that name
     │   ├── UnknownArgumentError      a keyword argument that does not exist
     │   └── ScenarioError         a map without a place for a scenario
     ├── MapError               a map that cannot be read, built or driven on

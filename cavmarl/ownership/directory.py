@@ -129,9 +129,9 @@ class Directory:
         return self._logged(Reset(episode, tick, self.run))
 
     def host(self, zone: int, worker: int) -> Output:
-        """Give a zone to a new process of `worker`, which must be loaded with `hosting(zone)`.
+        """Give a zone to a new host in process `worker`; the host must load `hosting(zone)`.
 
-        During a tick, the zone must be fenced first. The new process receives the STEP again.
+        During a tick, the zone must be fenced first. The new host receives the STEP again.
         """
         table = self.table
         if table.plan is not None:

@@ -28,7 +28,7 @@ from cavmarl.ownership.planning import OwnershipPlan, make_plan
 from cavmarl.ownership.transitions import Event, Party, State, after
 
 _Move: TypeAlias = tuple[int, int, int, bool]
-"""(vehicle, zone, epoch, whether it enters the zone or leaves it)."""
+"""(vehicle, zone, epoch, True if it enters the zone and False if it leaves it)."""
 
 
 class Table:

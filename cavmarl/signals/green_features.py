@@ -30,8 +30,8 @@ GREEN_FEATURES = (
     "waited",  # sum of the times that vehicles have been stopped, / 200 s
     "most_waited",  # on a lane, / 200 s
     "pressure",  # see `SignalTable`, / 10
-    "behind",  # vehicles on the lanes behind the signal, / 20
-    "standing_behind",  # / 10
+    "behind",  # vehicles on the outgoing lanes, / 20
+    "standing_behind",  # stopped vehicles on the outgoing lanes, / 10
     "most_filled",  # vehicles as a share of the vehicles that a lane holds
     "movements",  # number of movements that the green opens, / 5
 )

@@ -35,13 +35,13 @@ class SignalTable:
     Attributes:
         ids: ids of the signals (S,).
         greens: letters of the greens of each signal, as codes (num_greens, num_links).
-        lanes: ids of the lanes before and behind the signals (N,).
+        lanes: ids of the lanes before and after the signals (N,).
         movements: for each signal, (M, 2) pairs of the lanes before and after a movement, as
             indices of `lanes`, in the order of the signal's links, without repetitions.
         opened: for each signal, (num_greens, M) whether a green opens a movement.
         served: weight 1 for each lane that a green opens.
         pressure: for each movement that a green opens, weight 1 for the lane before the signal, and
-            -1 for the lane behind it.
+            -1 for the lane after it.
         prolonging: weight 1 for each lane whose detector prolongs a green, by the rule of actuated
             programs (`roads.sumo_net.detectors`).
         green_s: (S, G) duration of each green in the map's program; 0 beyond a signal's greens.

@@ -137,7 +137,7 @@ class _Questions:
         spawns: poses of spawn points, on the road.
         starts: poses before junctions, one for each movement of cars.
         distances_m: lengths of the paths from there to `ends`.
-        ends: poses behind junctions.
+        ends: poses after junctions.
         insides: poses in the middle of the paths of junctions in which paths cross.
         junctions: the junction of each of these.
         before_lights: poses before traffic lights, one for each lane.

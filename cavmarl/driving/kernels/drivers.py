@@ -3,7 +3,7 @@
 Accelerations follow the car-following model of the vehicle's type, lane changes follow MOBIL. This
 file finds the inputs of these models:
 
-- the leader, also on the next lanes and behind a junction;
+- the leader, also on the next lanes and after a junction;
 - the next lower speed limit, and the end of the lane;
 - the line at which the vehicle must stop, for a signal or for vehicles with the right of way;
 - a vehicle that wants to merge;

@@ -16,7 +16,7 @@ class ControlledSignals(NamedTuple):
     first_phase: NDArray[np.int32]  # (S,) PHASE row of the first green
     num_greens: NDArray[np.int32]  # (S,)
     incoming: NDArray[np.int32]  # (S, I) indices of lanes before the signal; -1: none
-    outgoing: NDArray[np.int32]  # (S, O) lanes behind the signal
+    outgoing: NDArray[np.int32]  # (S, O) lanes after the signal
     approach: NDArray[np.int32]  # (S, A) incoming lanes, and lanes that lead to them
     lane_row: NDArray[np.int32]  # (N,) LANE rows
     lane_index: NDArray[np.int32]  # (L,) index of each LANE among the N lanes; -1: not watched

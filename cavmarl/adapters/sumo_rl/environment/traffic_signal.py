@@ -47,7 +47,7 @@ class TrafficSignal:
         id: id of the signal.
         env: the environment.
         lanes: ids of the lanes before the signal, in the order of its links.
-        out_lanes: ids of the lanes behind the signal.
+        out_lanes: ids of the lanes after the signal.
         lanes_length: length of each of these lanes in m.
         green_phases: the greens.
         all_phases: the greens, and the yellow phase of each ordered pair of greens.

@@ -1,7 +1,7 @@
 """Right of way: whether a driver may enter a link, or leave a waiting position inside a junction.
 
 A driver enters a link if no foe occupies the shared area at the same time, if the driver yields to
-no foe with the right of way, and if there is room behind the junction. Some links have a waiting
+no foe with the right of way, and if there is room after the junction. Some links have a waiting
 position inside the junction, for example for oncoming traffic before a left turn. Foes beyond that
 position are checked there and not at the stop line. All results are minima or disjunctions over the
 foes, so the order of rows does not matter.

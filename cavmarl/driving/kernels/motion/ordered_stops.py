@@ -11,7 +11,7 @@ from cavmarl.core.records.codes import UNTIL_DEPARTURE
 STANDING_MPS = 0.1
 STOPPED_M = 3.0  # a vehicle is at a stop if its front is at most this far before the stop
 PASSED_M = 1.0  # a vehicle has missed a stop if its front is this far beyond the stop
-STAY = 2  # result of `change_for_stop`
+STAY = 2  # result of `change_for_stop`: the vehicle is on the lane of the stop
 LANE_EARLY_M = 100.0  # distance before a stop at which the driver changes to the stop's lane
 
 

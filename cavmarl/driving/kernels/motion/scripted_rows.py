@@ -47,7 +47,7 @@ def follow_script(
     roads: RoadArrays,
     travel: TripTables,  # with the scripts
     cues: NDArray[np.int64],  # (T,) tick in which each cue was given, -1: not yet
-    row: np.void,  # VEHICLE, the committed record; updated
+    row: np.void,  # VEHICLE before the tick; overwritten with the state after it
     dt: float,  # length of the tick, s
 ) -> None:
     """Advance a scripted row by one tick."""

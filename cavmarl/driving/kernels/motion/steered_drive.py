@@ -47,7 +47,7 @@ def steered_poses(
     steering_rad: float,  # largest steering angle
     link: int,  # LINK that the car takes
     begin_m: float,  # distance of the start before the stop line
-    end_m: float,  # distance of the end behind the junction
+    end_m: float,  # distance of the end after the junction
     dt: float,  # s
     # (m, 6) distance from the stop line, x, y, z, cosine and sine of the heading; overwritten
     poses: NDArray[np.float64],

@@ -18,7 +18,7 @@ TRIAL_MPS = 3.5  # approximate speed in sharp bends
 FASTER_MPS = 4.2  # approximate speed in bends of 90°
 TRIAL_DT_S = 0.1
 SWING_M = 0.5  # tolerated distance of a body beyond the middle of a road
-BEYOND_M = 12.0  # distance before and behind a junction within which a car swings out
+BEYOND_M = 12.0  # distance before and after a junction within which a car swings out
 MOST_TICKS = 5000
 
 
