@@ -130,8 +130,8 @@ def test_drivers_on_equal_roads_see_the_vehicles_to_which_their_foe_yields(
     middle = np.bincount(links["junction"]).argmax()
     one, other, *rest = ends = np.unique(links["from_lane"][links["junction"] == middle])
     assert len(rest) == 2
-    # Links from `one` now yield to a single link: of the links from `other`, the one that itself
-    # yields to the most links.
+    # Links from `one` now yield to a single link: the link from `other` with the most duties to
+    # yield.
     owner = np.repeat(np.arange(len(links)), links["num_conflicts"])
     yields = np.bincount(owner[conflicts["must_yield"]], minlength=len(links))
     conflicts["foe"][links["from_lane"][owner] == one] = np.argmax(
