@@ -466,7 +466,7 @@ class Run:
 
 
 @contextmanager
-def opened(args: Args, ranks: Ranks) -> Iterator[Run]:
+def opened(args: Args, ranks: Ranks = ALONE) -> Iterator[Run]:
     """Open a run with its worlds and its folder, and close them at the end."""
     num_envs = ranks.share("--num-envs", args.num_envs)
     plugins = [word for word in args.plugins.split(",") if word]
