@@ -41,7 +41,9 @@ def test_results_with_sumo_do_not_depend_on_zones(tmp_path: Path, source: str) -
 
 
 @pytest.mark.parametrize("source", MODES)
-def test_vehicle_counts_of_bologna_match_sumo_for_two_minutes(shared_maps: Path, source: str) -> None:
+def test_vehicle_counts_of_bologna_match_sumo_for_two_minutes(
+    shared_maps: Path, source: str
+) -> None:
     bologna(shared_maps, source, 120)
 
 
