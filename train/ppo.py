@@ -84,7 +84,7 @@ class Args:
     imitate: Annotated[str, "driver to imitate at first; empty: the built-in one"] = ""
     imitation_weight: Annotated[float, "initial weight of the distance to that driver"] = 0.0
     imitation_share: Annotated[float, "share of the run in which this weight falls to 0"] = 0.1
-    start: Annotated[str, "driver to start from: weights, form, sensors and actions"] = ""
+    start: Annotated[str, "driver to start from: weights, architecture, sensors, actions"] = ""
     end_at_red: Annotated[bool, "end returns at a red light, as at a crash"] = False
     opponents: Annotated[str, "drivers of some seats, not learnt from; comma-separated"] = ""
     opponent_share: Annotated[float, "share of the seats of each opponent"] = 0.1
