@@ -1,4 +1,4 @@
-"""Divided worlds that are coupled with SUMO equal the undivided world bit for bit."""
+"""Worlds coupled with SUMO: zones do not change results, and counts of vehicles equal SUMO's."""
 
 from __future__ import annotations
 
@@ -41,13 +41,15 @@ def test_results_with_sumo_do_not_depend_on_zones(tmp_path: Path, source: str) -
 
 
 @pytest.mark.parametrize("source", MODES)
-def test_counts_of_bologna_equal_sumos_for_two_minutes(shared_maps: Path, source: str) -> None:
+def test_vehicle_counts_of_bologna_match_sumo_for_two_minutes(
+    shared_maps: Path, source: str
+) -> None:
     bologna(shared_maps, source, 120)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("source", MODES)
-def test_counts_of_bologna_equal_sumos_for_an_hour(shared_maps: Path, source: str) -> None:
+def test_vehicle_counts_of_bologna_match_sumo_for_an_hour(shared_maps: Path, source: str) -> None:
     bologna(shared_maps, source, 3600)
 
 

@@ -4,13 +4,14 @@
     python train/five_seeds.py --config configs/train/tasks.yaml --env intersection exit --seeds 0 1
 
 The program runs `ppo.py` with each seed on one core, and evaluates the trained and the scripted
-drivers on the same held-out episodes. It writes into the folder: `table.md`, `result.json`,
+drivers on the same held-out episodes. It writes into the folder `--out`: `table.md`, `result.json`,
 `curves.svg`, `evaluation/` with its manifest and raw tables, and the runs, each with its own
 manifest. Finished seeds are not trained again; interrupted seeds resume from their checkpoints. If
 this program ends for any reason, its trainings end, too.
 
-Trained drivers have the interval of the mean over training seeds, scripted drivers the interval of
-the mean over evaluation runs. Both are 95 % by Student's t, clipped to 0 and 100 % for shares.
+The interval of a trained driver covers the spread between training seeds. The interval of a
+scripted driver covers the spread between evaluation runs. Both are 95 % confidence intervals of the
+mean by Student's t, clipped to 0 and 100 % for shares.
 `alone` is `idm` without any other vehicle: an upper bound, unless `idm` itself causes failures.
 """
 
@@ -97,7 +98,8 @@ def parse_args(words: Sequence[str] | None = None) -> list[Args]:
     envs = given["env"] or [env_of(given["config"])]
     if len(set(given["seeds"])) < 2 or given["repeats"] < 2 or given["jobs"] < 1:
         raise ConfigError(
-            "--seeds and --repeats: must be at least 2 for an interval; --jobs: at least 1"
+            "--seeds: give at least 2 different seeds, for an interval; --repeats: must be at "
+            "least 2; --jobs: must be at least 1"
         )
     return [
         Args(**given | {"env": env, "out": out if len(envs) == 1 else out / Path(env).stem})

@@ -84,7 +84,7 @@ class Args:
     imitate: Annotated[str, "driver to imitate at first; empty: the built-in one"] = ""
     imitation_weight: Annotated[float, "initial weight of the distance to that driver"] = 0.0
     imitation_share: Annotated[float, "share of the run in which this weight falls to 0"] = 0.1
-    start: Annotated[str, "driver to start from: weights, form, sensors and actions"] = ""
+    start: Annotated[str, "driver to start from: weights, architecture, sensors, actions"] = ""
     end_at_red: Annotated[bool, "end returns at a red light, as at a crash"] = False
     opponents: Annotated[str, "drivers of some seats, not learnt from; comma-separated"] = ""
     opponent_share: Annotated[float, "share of the seats of each opponent"] = 0.1
@@ -466,7 +466,7 @@ class Run:
 
 
 @contextmanager
-def opened(args: Args, ranks: Ranks) -> Iterator[Run]:
+def opened(args: Args, ranks: Ranks = ALONE) -> Iterator[Run]:
     """Open a run with its worlds and its folder, and close them at the end."""
     num_envs = ranks.share("--num-envs", args.num_envs)
     plugins = [word for word in args.plugins.split(",") if word]

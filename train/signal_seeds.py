@@ -5,9 +5,9 @@
 
 The first command trains on each map with each seed (`signals_sb3.py`, one training at a time), runs
 the scripted controllers in the same worlds, and writes all figures after each training or run. If
-the command is interrupted, run it again to continue. The second command prints the table. Trained
-networks have the 95 % interval of the mean over training seeds, and scripted controllers have the
-95 % interval of the mean over evaluation runs.
+the command is interrupted, run it again to continue. The second command prints the table. The 95 %
+interval of a trained network covers the spread between training seeds. The 95 % interval of a
+scripted controller covers the spread between evaluation runs.
 
 The maps are in the wheel of sumo-rl (`sumo_rl/nets/RESCO`). Their licences are non-commercial or
 the GPL, so the package does not contain them.

@@ -88,7 +88,7 @@ VEHICLE = np.dtype(
         ("source_zone", np.int32),  # source of the transfer in progress
         ("target_zone", np.int32),
         ("epoch", np.int32),  # number of changes of owner
-        ("transfer", np.int32),  # AUTHORITATIVE, or a state of the transfer protocol
+        ("transfer", np.int32),  # AUTHORITATIVE; other values are reserved
         # agents' vehicles only
         ("sensor_phase", np.int32),  # ticks until slow sensors fire; reserved: all fire each step
         ("episode_return", np.float64),  # sum of rewards since the agent got this vehicle

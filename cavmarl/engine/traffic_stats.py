@@ -28,7 +28,7 @@ class TrafficStats:
     running: int  # vehicles in the world
     arrived: int  # vehicles that reached their goal
     contacts: int  # vehicles that began to touch another vehicle
-    removed: int  # agents removed after a collision or off the road
+    removed: int  # vehicles that left without reaching their goal, for example after a collision
     rerouted: int  # changes of route; one vehicle may count several times
     mean_speed_mps: float  # mean over the vehicles in the world now
     mean_trip_m: float  # mean over the arrived vehicles

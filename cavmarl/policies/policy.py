@@ -40,7 +40,7 @@ class Policy(ABC):
 
     @cached_property
     def _nothing(self) -> dict[str, NDArray[np.float64]]:
-        """Zeros for the sensors of a Dict that a vehicle of a fleet may not carry."""
+        """Zeros by sensor, which replace the sensors that a vehicle of a fleet does not carry."""
         config = self.env.config
         if not (config.population.fleet and config.observation.mode == "sensors"):
             return {}
@@ -55,7 +55,7 @@ class Policy(ABC):
         """Return the actions of all agents of all worlds.
 
         Args:
-            observations: (W, A, D) flat.
+            observations: (W, A, D) worlds, agents, numbers per observation; flat.
             mask: (W, A) agents that act; other actions are ignored.
 
         Returns:

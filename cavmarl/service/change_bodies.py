@@ -14,7 +14,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 World = Annotated[int, Field(ge=0, lt=1024)]
 Lanes = Annotated[list[Annotated[int, Field(ge=0, lt=MOST_LANES)]], Field(max_length=MOST_LANES)]
 Plain = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_]{1,64}$")]  # never a path
-Table = Literal["observations", "samples", "messages"]  # possible with several worlds
+Table = Literal["observations", "samples", "messages"]  # not "commands": for one world only
 
 
 class _Change(BaseModel):
@@ -92,7 +92,7 @@ Change = Annotated[
 
 
 class KeptRecording(_Change):
-    """The recording of a session in its saved state."""
+    """The recording of a session in its saved state; each saved state ends a part of it."""
 
     include: Annotated[list[Table], Field(max_length=3)]
     part: Annotated[int, Field(ge=0, lt=1 << 31)]  # number of the next part
@@ -101,6 +101,6 @@ class KeptRecording(_Change):
 class KeptSession(_Change):
     """The part of a session's saved state that is not the state of its worlds."""
 
-    begun_anew: list[bool]  # worlds that a page has restarted since the last command
+    begun_anew: list[bool]  # of each world: its web page restarted it after the last command
     scenario: SetScenario | None  # None: the scenario of the configuration
     recording: KeptRecording | None

@@ -54,7 +54,7 @@ class SessionWorld:
     Attributes:
         number: number of commands so far.
         saved: number of commands that the state stored with the service includes.
-        is_changed: whether a page has changed the worlds since that state was stored.
+        is_changed: whether a page (the viewer in a browser) has changed the worlds since `saved`.
         is_commanded: whether a command is running, so that pages have to wait.
         recording: the recording of the worlds; None: they are not recorded.
     """
@@ -364,7 +364,7 @@ class SessionWorld:
         ]
 
     def ownership(self) -> dict[str, list[list[int]]]:
-        """Return transfers since the last call, and prepared ones, as in `TransfersBody`."""
+        """Return the transfers since the last call and the prepared ones, see `TransfersBody`."""
         rows, prepared = [], []
         for world, log in enumerate(self._worlds.transfers):
             known, number = self._told[world], self._num_transfers(world)

@@ -22,9 +22,10 @@ from cavmarl.cosim.stack.stack_types import EgoPose, Mission, Obstacle
 def test_a_camera_distinguishes_a_pedestrian_from_a_van() -> None:
     """Check the class of each detected object against the true object at its place.
 
-    A group of lidar echoes gets the class of most of its pixels. Pixels have exact classes and are
-    0.2 m wide at 16 m; echoes have errors of 2 cm. The test skips detections while the pedestrian
-    is close to the van, because objects less than 0.8 m apart form one group.
+    A group of lidar echoes gets the most frequent class among the camera pixels onto which its
+    echoes fall. Pixels have exact classes and are 0.2 m wide at 16 m; echoes have errors of 2 cm.
+    The test skips detections while the pedestrian is close to the van, because objects less than
+    0.8 m apart form one group.
     """
     env = cavmarl.parallel_env(
         "grid4x4",

@@ -102,7 +102,7 @@ def test_only_the_rows_of_the_newest_transfers_are_computed() -> None:
     for first in range(0, 6 * batch, batch):
         later(first, batch)
     assert log.counts == {"switched": 6 * batch, "removed": 6}
-    assert made == [], "rows are computed before they are read"
+    assert made == [], "rows were computed although nothing has read them yet"
     assert [row.tick for row in log.rows] == list(range(2 * batch, 6 * batch))
     assert made == [2 * batch, 3 * batch, 4 * batch, 5 * batch]
     later(6 * batch, 3)

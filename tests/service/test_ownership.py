@@ -1,4 +1,8 @@
-"""The service restores owners of vehicles and members of sessions from its log."""
+"""The service restores owners of vehicles and members of sessions from its log.
+
+With `zone_nodes`, the zones of a session are divided into that many parts. `members` names the node
+of each part. The session's own node leads the parts; they connect to its door, a network address.
+"""
 
 from __future__ import annotations
 
@@ -97,7 +101,7 @@ def test_a_repeated_request_with_the_same_key_is_executed_once(fleet: Fleet) -> 
         fleet.open(key="k-1")
 
 
-def test_a_session_reports_prepared_transfers_and_each_transfer_once() -> None:
+def test_a_session_reports_each_finished_transfer_once_and_also_prepared_transfers() -> None:
     document = {"environment": "grid4x4", "num_envs": 1, "seed": 0, "overrides": {}}
     document |= {"zones": 4, "agents": 4, "background": 40, "max_cycles": None}
     world = SessionWorld(document, None, 0, {})

@@ -22,30 +22,31 @@ MODEL_ACC = 2
 INSERT_NONE = 0
 INSERT_VEHICLE = 1
 
-# DEPARTURE["lane_code"]: the lane of its edge on which a vehicle enters
+# DEPARTURE["lane_code"]: the lane of its edge on which a vehicle enters, as SUMO's `departLane`.
+# Only open lanes count from which the vehicle can reach its goal.
 LANE_GIVEN = 0
-LANE_FIRST = -1  # the allowed lane nearest to the kerb
+LANE_FIRST = -1  # the lane nearest to the kerb
 LANE_RANDOM = -2
-LANE_FREE = -3  # the least occupied lane
-LANE_ALLOWED = -4
-LANE_BEST = -5  # a lane from which the route continues without a lane change
+LANE_FREE = -3  # the lane with the fewest vehicles
+LANE_ALLOWED = -4  # treated like LANE_FREE
+LANE_BEST = -5  # as LANE_FREE, among the lanes that the route follows furthest without a change
 
-# DEPARTURE["pos_code"]: the position on the lane
+# DEPARTURE["pos_code"]: the position on the lane, as SUMO's `departPos`
 POS_GIVEN = 0
 POS_BASE = 1  # rear bumper at the start of the lane
-POS_RANDOM = 2
-POS_FREE = 3
-POS_RANDOM_FREE = 4
+POS_RANDOM = 2  # a random place, drawn again in each tick until the vehicle can enter
+POS_FREE = 3  # treated like POS_RANDOM
+POS_RANDOM_FREE = 4  # treated like POS_RANDOM
 POS_LAST = 5  # behind the last vehicle
 
-# DEPARTURE["speed_code"]: the initial speed
+# DEPARTURE["speed_code"]: the initial speed, as SUMO's `departSpeed`
 SPEED_GIVEN = 0
 SPEED_RANDOM = 1
 SPEED_MAX = 2  # the highest safe speed
-SPEED_DESIRED = 3
+SPEED_DESIRED = 3  # limit times speed factor
 SPEED_LIMIT = 4
 SPEED_LAST = 5  # speed of the last vehicle on the lane
-SPEED_AVERAGE = 6
+SPEED_AVERAGE = 6  # mean speed of the vehicles on the lane
 
 # STOP["until_from"]: the time to which the earliest end of a stop (`until`) is relative
 UNTIL_ABSOLUTE = 0
@@ -68,7 +69,7 @@ EVENT_OUT_OF_TIME = 32  # its trip has exceeded its time limit
 EVENTS_OF_FATE = EVENT_COLLIDED | EVENT_OFF_ROAD | EVENT_ARRIVED  # have priority over OUT_OF_TIME
 EVENTS_THAT_END = EVENTS_OF_FATE | EVENT_OUT_OF_TIME
 
-# VEHICLE["transfer"]
+# VEHICLE["transfer"]: the only state in which a row is saved or sent
 AUTHORITATIVE = 0
 
 # Letters of signals as codes: positions in roads.network.SIGNAL_STATES = "rugGysoOY".
@@ -96,7 +97,7 @@ ACTION_SLOWER = 4
 # DepartureQueue.counts, since reset
 COUNT_DEPARTED = 0  # vehicles that have entered
 COUNT_ARRIVED = 1  # vehicles that reached their goal
-COUNT_REMOVED = 2  # agents removed after a collision or off the road
+COUNT_REMOVED = 2  # vehicles that left without reaching their goal, for example after a collision
 COUNT_REROUTED = 3  # vehicles that left their route for another route
 NUM_COUNTS = 4
 
@@ -106,6 +107,7 @@ SUM_TIME_S = 1
 SUM_DELAY_S = 2  # trip time minus time at the speed that limit, driver and type allow
 NUM_SUMS = 3
 
-# First bits of LANE["permissions"] that bar vehicle classes from changes to the left and right.
+# In LANE["permissions"], bit NO_CHANGE_LEFT + k (NO_CHANGE_RIGHT + k) bars vehicle class k from
+# changing to the left (right).
 NO_CHANGE_LEFT = 12
 NO_CHANGE_RIGHT = 22

@@ -3,8 +3,9 @@
 Control uses pure pursuit for the steering, and limits of the vehicle class for the acceleration.
 Coulter: "Implementation of the pure pursuit path tracking algorithm", CMU-RI-TR-92-01, 1992: the
 circle through the vehicle's centre, tangent to its motion, that meets a point of the path ahead has
-the curvature 2 sin(alpha) / distance. The kinematic bicycle turns with that curvature at the slip
-angle asin(curvature · L / 2), whose tangent is half the tangent of the steering angle.
+the curvature 2 sin(alpha) / distance. A kinematic bicycle of length L (here the vehicle's length)
+follows this curvature if its slip angle is asin(curvature · L / 2). The tangent of the steering
+angle is twice the tangent of the slip angle.
 """
 
 from __future__ import annotations
@@ -91,7 +92,7 @@ class PurePursuit:
 
 
 def _point_at(trajectory: Trajectory, pose: EgoPose, ahead_m: float) -> tuple[float, float]:
-    """Return the point of the route `ahead_m` beyond the place beside the vehicle."""
+    """Return the point of the route `ahead_m` beyond its point nearest to the vehicle."""
     points = trajectory.points
     steps = np.diff(points, axis=0)
     lengths = np.hypot(steps[:, 0], steps[:, 1])

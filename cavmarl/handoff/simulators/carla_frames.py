@@ -41,10 +41,11 @@ BLUEPRINTS = {
     "lidar": "sensor.lidar.ray_cast",
     "radar": "sensor.other.radar",
 }
-_NOT_GIVEN = ("bev_grid",)  # sensors of the surroundings for which CARLA has no frames
+_NOT_GIVEN = ("bev_grid",)  # CARLA has no frames for these; cavmarl computes imu, gnss and so on
 MOST_RADAR_DEG = 179.0  # field of view of CARLA's radars
 _RADAR_HEIGHT_DEG = 0.1  # CARLA's radars scan a cone, but a rig's radars scan a plane
-_PER_RAY = 2  # columns of a CARLA lidar per ray of the rig: every other column is on the ray
+# CARLA's lidar gets two columns per ray of the rig; only every other column lies on a ray.
+_PER_RAY = 2
 # Adjacent echoes belong to one target if they differ by at most these values.
 _SAME_TARGET_M, _SAME_TARGET_MPS = 3.0, 1.0
 _ON_GROUND_M = 0.2  # echoes below this height come from the ground
@@ -75,11 +76,11 @@ def check_option(options: Mapping[str, str]) -> None:
 
 
 def check_rig(zone: int, options: Mapping[str, str], rig: Mapping[str, MountedConfig]) -> None:
-    """Check that CARLA's sensors can take the samples of a rig, if they are to take them.
+    """With `frames=backend`, check that CARLA can give the frames of a rig.
 
     Raises:
-        ConfigError: the rig has a sensor of the surroundings without frames of CARLA, a
-            sensor with noise, or a radar with a wider field of view than CARLA's.
+        ConfigError: the rig has a `bev_grid`, for which CARLA has no frames, a sensor with noise or
+            bias whose frames come from CARLA, or a radar with a wider field of view than CARLA's.
     """
     if not gives_frames(options):
         return

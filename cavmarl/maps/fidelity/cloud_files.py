@@ -37,7 +37,7 @@ class Cloud:
 
     name: str
     points: Points  # (n, 3) x, y, z in m
-    # number of points "read", then the number that each filter removed, in order
+    # "read": number of points in the file; then, by name of filter: how many points it removed
     counts: dict[str, int] = field(default_factory=dict)
 
     def kept(self, points: Points, filter_name: str) -> Cloud:
@@ -51,7 +51,9 @@ def is_cloud(path: Path) -> bool:
 
 
 def read_cloud(path: Path) -> Cloud:
-    """Return the points of a file, in the file's frame and unit (las: with the file's scale).
+    """Return the points of a file, in the file's frame and unit.
+
+    The scale and offset in the header of a las file are applied.
 
     Raises:
         MapError: the file is missing, truncated, of another kind, or has no valid point.

@@ -26,7 +26,7 @@ class StepPlacement:
     """The plans of all workers: one plan of all worlds, or one plan of the zones of each world.
 
     Raises:
-        ConfigError: there are more workers than zones.
+        ConfigError: there are more workers than zones of all worlds.
         NoAdmissibleWorkerError: workers are too busy.
     """
 

@@ -51,7 +51,7 @@ def make_plans(
     """Distribute worlds evenly over workers; divide the worlds if there are more workers.
 
     Raises:
-        ConfigError: there are more workers than zones.
+        ConfigError: there are more workers than zones of all worlds.
         NoAdmissibleWorkerError: workers are too busy.
     """
     count = world.partition.count

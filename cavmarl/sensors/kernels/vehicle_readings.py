@@ -41,8 +41,9 @@ def measure_motion(
         rate  = (r sin pitch, -pitch', r cos pitch)
 
     Speed, acceleration, yaw rate, steering and pitch are interpolated linearly between the states
-    before and after the tick; r' and pitch' are the slopes. The change of the slip angle is
-    neglected, because the steering of the bicycle jumps.
+    before and after the tick; r' and pitch' are the slopes. The rate of the slip angle is
+    neglected: the bicycle model changes the steering at once at the start of a tick, so the
+    rate would give force peaks.
 
     `row`: VEHICLE after the tick. `pose`: POSE before the tick; if it belongs to another vehicle,
     the state of `row` is used. `share`: elapsed share of the tick, in (0, 1]. `out`: (6,) m/s² and

@@ -20,9 +20,10 @@ from cavmarl.signals.kernels.controlled_signals import (
 from cavmarl.signals.kernels.green_choices import GREEN
 from cavmarl.signals.kernels.lane_counts import STANDING, VEHICLES
 
-# Columns of the history (W, N, HISTORY) of lanes.
-RED_TICKS = 0  # ticks for which a stopped vehicle on the lane has had red, see `follow_lanes`
-RED_VEHICLE_TICKS = 1  # sum of these ticks over all vehicles on the lane, stopped or not
+# Columns of the history (W, N, HISTORY): W worlds, N lanes. `follow_lanes` updates the first two at
+# each decision.
+RED_TICKS = 0  # ticks of red since vehicles have been stopped on the lane without interruption
+RED_VEHICLE_TICKS = 1  # since the lane became red: sum of ticks times vehicles on the lane
 DETECTED_MS = 2  # time since the reset at which the lane's detector was last occupied
 PASSED = 3  # number of vehicles that the detector has counted in the current interval
 FLOW = 4  # number of vehicles that the detector counted in the last interval
@@ -36,7 +37,7 @@ def follow_detectors(
     controlled: ControlledSignals,
     interval: int,  # ticks of an interval in which vehicles are counted
     dt: float,
-    chosen: NDArray[np.bool_],  # (W,)
+    chosen: NDArray[np.bool_],  # (W,) worlds in which a tick has ended
     ticks: NDArray[np.int64],  # (W,)
     detected_s: NDArray[np.float64],  # (W, D) see `roads.kernels.signal_phases.detect`
     history: NDArray[np.int64],  # (W, N, HISTORY) updated
@@ -75,8 +76,8 @@ def follow_lanes(
 ) -> None:
     """Add the time since the last decision to the lanes that are red, at each decision.
 
-    A lane is red unless the current green, or the next green during yellow and all-red, opens a
-    movement from it. `RED_TICKS` restarts if no vehicle is stopped on the lane at a decision.
+    A lane is red unless the current green opens a movement from it; during yellow and all-red, the
+    next green counts. `RED_TICKS` restarts if no vehicle is stopped on the lane at a decision.
     """
     num_signals = controlled.row.size
     if num_signals == 0:

@@ -18,16 +18,16 @@ from cavmarl.traffic.demand.element import Element
 # Lanes: a LANE row (in an ORDER), SUMO's index on the edge (in an ELEMENT), or one of these codes.
 LANE_FIRST = -1  # the lane nearest to the kerb that the class may use
 LANE_RANDOM = -2
-LANE_FREE = -3  # the lane with the fewest vehicles
-LANE_ALLOWED = -4  # the lane with the fewest vehicles among the lanes open to the class
-LANE_BEST = -5  # the lane that the route can follow furthest
+LANE_FREE = -3  # the lane with the fewest vehicles, among the lanes that the class may use
+LANE_ALLOWED = -4  # treated like LANE_FREE
+LANE_BEST = -5  # as LANE_FREE, among the lanes that the route can follow furthest
 LANE_CURRENT = -6  # arrival: the present lane
 
 POS_GIVEN = 0
 POS_BASE = 1  # the rear bumper at the start of the lane (SUMO's default)
-POS_RANDOM = 2
-POS_FREE = 3  # the first gap
-POS_RANDOM_FREE = 4  # a random place; if it is taken, the first gap
+POS_RANDOM = 2  # a random place; departures draw it again in each tick until they can enter
+POS_FREE = 3  # treated like POS_RANDOM
+POS_RANDOM_FREE = 4  # treated like POS_RANDOM
 POS_LAST = 5  # behind the last vehicle
 POS_MAX = 6  # arrival: at the end of the lane
 POS_CENTER = 7  # arrival: in the middle of the lane

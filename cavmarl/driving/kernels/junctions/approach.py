@@ -33,6 +33,7 @@ STANDS_BEFORE_M = 15.0  # distance from centre to lane end while a vehicle waits
 LEAST_M = 1e-9  # least distance beyond the line of a vehicle on the junction; 0: at the line
 BLOCK = 64  # number of rows that stay in the cache between both loops
 
+# A vehicle on a link, or before it.
 APPROACH = np.dtype(
     [
         ("link", np.int32),

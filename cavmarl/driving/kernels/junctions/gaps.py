@@ -3,6 +3,9 @@
 The gap model matches SUMO's. If the foe is before its line, both vehicles are assumed to need the
 whole junction, and the foe is assumed to keep its acceleration. If the foe is on the junction, only
 the shared area counts. If one of the two vehicles is steered, other time gaps apply.
+
+`row` is the VEHICLE of the deciding driver, the ego vehicle. `foe` is a foe's APPROACH, the record
+of a vehicle on or before a link (`approach.py`), and `other` is the VEHICLE of the same foe.
 """
 
 from __future__ import annotations
@@ -41,8 +44,10 @@ BRISK_ACCEL = 2.5  # m/s²: assumed acceleration towards a shared area
 GENTLE_ACCEL = 1.8  # m/s²: assumed acceleration out of a shared area, lower to be safe
 GENTLE_SHARE = GENTLE_ACCEL / BRISK_ACCEL  # `GENTLE_ACCEL` as a share of acceleration
 HARD_STOP = 5.0  # m/s²: a vehicle that would have to brake harder for the line will not stop
-AHEAD_S = 1.0  # time gap to a foe at its line (SUMO's gap of 1.0 s starts closer to the ego line)
-STOPPED_FOE_S = 30.0  # assumed delay of a foe that can stop, after the ego driver has waited long
+# The foe must reach its line at least this long after the ego vehicle has left the junction. SUMO's
+# gap of 1.0 s starts closer to the ego line.
+AHEAD_S = 1.0
+STOPPED_FOE_S = 30.0  # assumed delay of a foe that can stop, reached after `IMPATIENCE_S`
 STEERED_AHEAD_S = 3.0  # time gap if one vehicle is steered, because it may be slower
 STEERED_MERGE_AHEAD_S = 1.5  # the same if both enter one lane, where one can follow
 SPEEDING_UP_MPS2 = 0.1  # a foe with at least this acceleration is assumed to keep accelerating
@@ -51,7 +56,7 @@ SET_OFF_S = 0.5  # a stopped vehicle starts this long before another vehicle lea
 ROOM_M = 3.0  # free space behind a vehicle that clears a junction
 IMPATIENCE_S = 180.0  # after this wait, a driver that yields fully expects foes to brake
 FORCED_STOP = 4.5  # m/s²: the deceleration that such a driver expects
-# A vehicle can accelerate on this share of the distance to a possible stop, then it has to brake.
+# A vehicle that may have to stop can accelerate over this share of the distance, then must brake.
 UNBRAKED_SHARE = FORCED_STOP / (FORCED_STOP + BRISK_ACCEL)
 CRAWL_MPS = 5.0  # a slower stream lets others merge
 STUCK_S = 90.0  # after this wait, a driver may also pass stopped vehicles that must yield to it
@@ -87,7 +92,10 @@ def is_red(roads: RoadArrays, link: int, phase: NDArray[np.int32]) -> bool:
 
 @kernel
 def earliest(distance: float, speed: float, limit: float, accel: float) -> float:
-    """Return the time in s to drive `distance` m with an acceleration up to `limit` m/s."""
+    """Return the time in s to drive `distance` m.
+
+    The vehicle accelerates with `accel` m/s² from `speed` up to at most `limit` m/s.
+    """
     if distance <= 0.0:
         return 0.0
     limit = max(limit, speed, 0.1)
@@ -154,13 +162,14 @@ def may_ignore(
 ) -> bool:
     """Return whether a driver at `link` may ignore a foe at `foe_link` with the right of way.
 
-    `signal` is the state of the foe's signal; `state` and `foe_state` are the links' states. After
-    a wait of `stuck_s` s, the driver may also ignore a stopped foe that yields.
+    `signal` is the state of the foe's signal; `state` and `foe_state` are the links' states. Where
+    vehicles go in turn, the driver may also ignore a stopped foe that yields, if it is the driver's
+    turn; elsewhere only after a wait of `stuck_s` s.
     """
     if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW:
         return True
     if signal == SIGNAL_YELLOW_MINOR or signal == SIGNAL_YELLOW_MAJOR:
-        return True  # foes that cannot stop were checked before
+        return True  # `_is_harmless` has excluded foes that cannot stop
     if can_be_ignored(foe):
         return True
     if signal == SIGNAL_NONE and foe_state == STATE_ALLWAY_STOP and foe["stopped_at"] != foe_link:
@@ -206,11 +215,11 @@ def _is_harmless(
     """Return whether an APPROACH can be ignored, no matter when it reaches the shared area.
 
     `front` is the distance in m from the front of the foe to the place where it can still stop.
-    `apart` is the distance in m by which the foe's rear leaves the shared area before the ego
-    front. `comes_last` says that the foe has to yield.
+    `apart` is the distance in m from the ego front to the end of the shared area, minus the
+    distance from the foe's rear to that end. `comes_last` says that the foe has to yield.
     """
     if front <= 0.0:
-        # Another vehicle blocks a foe that is stopped before the shared area.
+        # A foe that has been stopped for long before the shared area is blocked by another vehicle.
         before_area = foe["dist"] + conflict["foe_enter_m"] - foe["half"] > 0.0
         if before_area and foe["speed"] < STANDING_MPS and rows[foe["row"]]["wait_s"] > IMPATIENT_S:
             return True
@@ -225,7 +234,7 @@ def _is_harmless(
         return True
     other, foe_link = rows[foe["row"]], conflict["foe"]
     if equal and row["wait_s"] < STUCK_S:
-        return can_be_ignored(other)  # foes that let others go in a deadlock were excluded before
+        return can_be_ignored(other)  # `junctions` skips foes that let `row` go in a deadlock
     signal = link_signal(roads, foe_link, phase)
     state, foe_state = roads.links[link]["state"], roads.links[foe_link]["state"]
     alike = drives_as_sumo(travel, row) and drives_as_sumo(travel, other)
@@ -290,7 +299,7 @@ def _comes(
     time_out: float,
     leaves_mps: float,
 ) -> bool:
-    """Return whether the foe `other`, an APPROACH, reaches its line too soon for a row.
+    """Return whether a foe reaches its line too soon for the vehicle `row`.
 
     The row is at its line in `time_in` s, and leaves the junction in `time_out` s with `leaves_mps`
     m/s. If both drive into the same lane, the foe has to be able to slow down to that speed. The
@@ -383,9 +392,10 @@ def hold_for_foe(
     phase: NDArray[np.int32],
     equal: bool = False,  # whether both drivers resolve deadlocks on equal roads, see `deadlocks`
 ) -> int:
-    """Return the HOLD_* code of a foe: whether it would be in the shared area, or goes first.
+    """Return the HOLD_* code with which a foe holds back the vehicle `row`.
 
-    HOLD_EXIT_BLOCKED: the foe stays in the area. HOLD_YIELD: the foe will enter or leave the area.
+    HOLD_NONE: `row` need not wait for the foe. HOLD_EXIT_BLOCKED: the foe stays in the shared area.
+    HOLD_YIELD: the foe will enter or leave the area.
     """
     to_clear = foe["dist"] + conflict["foe_leave_m"] + foe["half"]
     if to_clear <= 0.0 or (foe["dist"] < foe["half"] and not conflict["near"]):
@@ -394,8 +404,9 @@ def hold_for_foe(
     foe_link = roads.links[conflict["foe"]]
     if foe_link["from_lane"] == target["from_lane"]:
         return HOLD_NONE  # the vehicle ahead goes first, see `behind_fork`
-    # Distance from the foe's front to the line at which it can still stop. This is its stop line
-    # or, if it passes that line and the shared area is further on, its waiting position inside.
+    # Distance from the foe's front to the place where it can still stop: its stop line. If the foe
+    # has passed that line or cannot stop there, and the shared area is beyond its waiting position
+    # on the junction, this position is the place.
     front = foe["dist"] - foe["half"] - roads.lanes[foe_link["from_lane"]]["stop_back_m"]
     comes_last = not (gives_way and conflict["must_yield"])
     if comes_last and front > 0.0 and not _is_committed(foe, front):

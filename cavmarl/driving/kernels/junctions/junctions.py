@@ -517,7 +517,7 @@ def _constraint_of(
     place: float,
     dt: float,
 ) -> float:
-    """Return the constraint of an APPROACH on a row that is `place` m beyond its stop line."""
+    """Return the constraint of `foe` on a row that is `place` m beyond its stop line."""
     half = 0.5 * row["length"]
     front = place + half
     foe_front = foe["half"] - foe["dist"]

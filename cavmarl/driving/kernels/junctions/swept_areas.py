@@ -233,7 +233,7 @@ def wait_place(roads: RoadArrays, link: int, half: float) -> float:
 def _is_in_the_way(
     rows: NDArray[np.void], row: np.void, foe: np.void, sweep: np.void, place: float, room_m: float
 ) -> bool:
-    """Return whether a row whose front is at `place` has to wait for an APPROACH."""
+    """Return whether the vehicle `row`, whose front is at `place`, has to wait for `foe`."""
     foe_place = foe["half"] - foe["dist"]
     foe_rear = foe_place - _body_m(foe["half"], sweep["other"])
     if foe_rear > sweep["foe_leave_m"] or row["wait_s"] > GIVE_UP_S:
