@@ -91,8 +91,8 @@ async def _sweep(service: Service, every_s: float) -> None:
         try:
             await log.settle()
             await asyncio.to_thread(log.store.check_lock)
-        except ServiceError:
-            log.is_broken = True
+        except ServiceError as error:
+            log.failure = log.failure or error
             service.on_broken()
             return
 
@@ -105,7 +105,7 @@ async def _check_older(service: Service, is_over: asyncio.Event) -> None:
             with suppress(TimeoutError):
                 await asyncio.wait_for(is_over.wait(), CHECK_S)
     except ServiceError as error:
-        log.is_broken, log.failure = True, error
+        log.failure = error
         service.on_broken()
 
 

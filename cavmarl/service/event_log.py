@@ -44,7 +44,7 @@ class EventLog:
 
     Attributes:
         origin: what the records were made from, as text.
-        failure: why the service must end, if a check of older events has failed.
+        failure: why the service must end: events cannot be written, or a check has failed.
 
     Raises:
         ServiceError: the stored events or their snapshot were modified.
@@ -63,7 +63,6 @@ class EventLog:
         self.sequence = 0  # sequence number of the last event
         self.failure: ServiceError | None = None
         self.changed = asyncio.Condition()  # notified after each write and by `stir`
-        self.is_broken = False
         self.wall_s = wall_s
         self._digest = ""
         self._lines: list[LogEvent] = []
@@ -266,8 +265,8 @@ class EventLog:
             return
         try:
             self.store.append(lines, blobs, gone, head, snapshot)
-        except ServiceError:
-            self.is_broken = True  # memory is ahead of the disk: the service must be restarted
+        except ServiceError as error:
+            self.failure = error  # memory is ahead of the disk: the service must be restarted
             raise
         if lines:
             self.durable = lines[-1].sequence
@@ -281,7 +280,7 @@ class EventLog:
         if not self._lines and not self._blobs and self.durable >= self.sequence:
             return
         async with self._writing:
-            if self.is_broken:
+            if self.failure is not None:
                 raise ServiceError(f"store {self.store.where}: cannot be written")
             if self._lines or self._blobs:
                 await asyncio.to_thread(self._write, *self._take())

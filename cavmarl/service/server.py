@@ -102,11 +102,6 @@ def serve(options: ServerOptions, tell: Callable[[str], None]) -> None:
         asyncio.run(_run(server, listener))
         if log.failure is not None:
             raise log.failure
-        if log.is_broken:
-            raise ServiceError(
-                f"store {store.where}: could not be written, or its connection was lost; see the "
-                "error above, if there is one, and start the service again"
-            )
         log.end()
     finally:
         listener.close()

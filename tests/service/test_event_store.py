@@ -192,7 +192,7 @@ def test_a_request_that_could_not_be_written_is_not_acknowledged(tmp_path: Path)
     fleet.register("a")
     with pytest.raises(ServiceError, match="cannot be written"):
         fleet.log.flush()
-    assert fleet.log.is_broken
+    assert fleet.log.failure is not None
     fleet.log.store.close()
     again = EventStore(tmp_path / "store.sqlite")
     assert sum(1 for _ in again.read()) == before
