@@ -27,7 +27,6 @@ import typer
 from numpy.typing import NDArray
 
 from benchmarks.program import run
-from benchmarks.shared_ground import shared_ground
 from benchmarks.world_draw import draw_world
 from benchmarks.world_files import cut_maps, make_net
 from cavmarl.bench.harness import BenchmarkReport, Say, check_range, numbers_of, silent
@@ -38,7 +37,7 @@ from cavmarl.driving.kernels.junctions.stop_line_registration import registratio
 from cavmarl.engine.world_setup import load_world
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.evaluate.recorder import Recorder
-from cavmarl.maps.defects import LEVEL_M
+from cavmarl.maps.shared_ground import LEVEL_M, shared_ground
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
 from cavmarl.roads.shown_signals import signal_codes

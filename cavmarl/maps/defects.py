@@ -14,17 +14,16 @@ from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.maps.buildings import points_inside, with_buildings
 from cavmarl.maps.net_document import NetDocument, points_of
 from cavmarl.maps.osm_roads import OsmRoads
+from cavmarl.maps.shared_ground import CAR_WIDTH_M, LEVEL_M, touching_roads
 from cavmarl.roads.network import CARS, RoadNetwork
 from cavmarl.roads.polylines import clean_shape
 from cavmarl.roads.sumo_net.road_corners import find_corners
 from cavmarl.roads.sumo_net.shared_strips import Road, Strip, find_strips
 
-CAR_WIDTH_M = 1.8
-LEVEL_M = 3.0  # lanes with a larger difference in height are a bridge and the road below it
 STEP_M = 0.1  # minimum difference in height of lanes that lead into each other
 SEARCHES = (
     "crossings", "signals", "lanes", "steps", "parts", "stop lines", "strips", "corners",
-    "buildings",
+    "ground", "buildings",
 )  # fmt: skip
 _DEEP_M = 1.0  # maximum distance of a stop line inside its junction
 
@@ -73,6 +72,7 @@ def find_defects(
         lambda: _stop_lines_inside(network, document),
         lambda: _shared_strips(network, document),
         lambda: _tight_corners(network),
+        lambda: _roads_on_shared_ground(network),
     ]
     if buildings is not None:
         searches.append(lambda: _buildings_on_roads(network, document, buildings))
@@ -275,6 +275,15 @@ def _tight_corners(network: RoadNetwork) -> Iterator[Defect]:
             x, y = shape[(corner.first + corner.last) // 2, :2].tolist()
             angle = f"{abs(np.degrees(corner.turn)):.0f} degrees"
             yield Defect("corner too tight for a car", network.lane_ids[lane], x, y, angle)
+
+
+def _roads_on_shared_ground(network: RoadNetwork) -> Iterator[Defect]:
+    """Find roads that touch at one height although no junction connects them."""
+    for one, other in touching_roads(network):
+        place = crossing_of(network.lane_polyline(one), network.lane_polyline(other))
+        x, y = place or network.lane_polyline(one)[0, :2].tolist()
+        words = f"with {network.lane_ids[other]}, at the same height"
+        yield Defect("roads on shared ground", network.lane_ids[one], x, y, words)
 
 
 def _inside(place: Points, rim: Points) -> bool:

@@ -1,18 +1,22 @@
-"""Parts of maps on which vehicles touch although drivers obey all rules."""
+"""Lanes of different roads that a map draws over each other at the same height.
+
+Vehicles touch there although their drivers obey all rules. An example is a tunnel in a map without
+heights.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.maps.defects import CAR_WIDTH_M, LEVEL_M
-from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.network import CARS, RoadNetwork
 from cavmarl.roads.routing import lane_grid
 
-CAR_LENGTH_M = 5.0
-STEP_M = 1.0
+CAR_WIDTH_M = 1.8
+LEVEL_M = 3.0  # lanes with a larger difference in height are a bridge and the road below it
+STEP_M = 1.0  # distance between the compared places of a lane
 
 
 def shared_ground(network: RoadNetwork) -> list[tuple[int, int]]:
@@ -41,11 +45,15 @@ def shared_ground(network: RoadNetwork) -> list[tuple[int, int]]:
     return sorted(found)
 
 
-def stub_lanes(network: RoadNetwork) -> NDArray[np.int64]:
-    """Return the LANE rows, on roads with several lanes, that are too short for lane changes."""
-    edges = network.edges[network.lanes["edge"]]
-    stubs = ~network.lanes["internal"] & (edges["num_lanes"] > 1)
-    return np.flatnonzero(stubs & (network.lanes["length_m"] < CAR_LENGTH_M))
+def touching_roads(network: RoadNetwork) -> list[tuple[int, int]]:
+    """Return one pair of `shared_ground`, open to cars, for each two roads or junctions."""
+    cars = network.lanes["permissions"] & CARS != 0
+    owners = _owners(network)
+    found: dict[Any, tuple[int, int]] = {}
+    for pair in shared_ground(network):
+        if cars[list(pair)].all():
+            found.setdefault(tuple((owners.inside[k], owners.ground[k]) for k in pair), pair)
+    return list(found.values())
 
 
 class _Owners(NamedTuple):
@@ -59,7 +67,8 @@ class _Owners(NamedTuple):
 
 def _owners(network: RoadNetwork) -> _Owners:
     inside, edge = network.lanes["internal"], network.lanes["edge"]
-    link = network.links[np.where(inside, network.lanes["link"], 0)]
+    links = network.links if len(network.links) else np.zeros(1, network.links.dtype)
+    link = links[np.where(inside, network.lanes["link"], 0)]
     road = network.edges[edge]
     return _Owners(
         inside.tolist(),

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.map_features import MAP_FEATURES, map_features
-from benchmarks.shared_ground import shared_ground, stub_lanes
+from benchmarks.map_features import MAP_FEATURES, map_features, stub_lanes
+from cavmarl.maps.defects import find_defects
+from cavmarl.maps.shared_ground import shared_ground
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net import reader
 from cavmarl.roads.sumo_net.reader import read_network
@@ -61,6 +62,30 @@ def test_a_road_over_a_junction_shares_ground_with_the_junction(
     assert bool(pairs) == meet
     for one, other in pairs:
         assert inside[one] != inside[other]
+
+
+@pytest.mark.parametrize(("height_m", "is_named"), [(0.0, True), (5.0, False)])
+def test_a_road_that_crosses_another_road_at_its_height_is_a_defect(
+    tmp_path: Path, height_m: float, is_named: bool
+) -> None:
+    nodes = {"a": (-60.0, 0.0, 0.0), "b": (60.0, 0.0, 0.0)}
+    nodes |= {"c": (0.0, -60.0, height_m), "d": (0.0, 60.0, height_m)}
+    points = "".join(
+        f'<node id="{name}" x="{x}" y="{y}" z="{z}"/>' for name, (x, y, z) in nodes.items()
+    )
+    lines = "".join(
+        f'<edge id="{a}{b}" from="{a}" to="{b}" numLanes="2"/>' for a, b in ("ab", "cd")
+    )
+    (tmp_path / "over.nod.xml").write_text(f"<nodes>{points}</nodes>")
+    (tmp_path / "over.edg.xml").write_text(f"<edges>{lines}</edges>")
+    (tmp_path / "over.con.xml").write_text("<connections/>")
+    path = netconvert(tmp_path, "over")
+    found = [one for one in find_defects(read_network(path), path) if "ground" in one.kind]
+    assert [one.kind for one in found] == ["roads on shared ground"] * is_named
+    for one in found:
+        assert (one.name[:2], one.about[:7]) == ("ab", "with cd")
+        assert abs(one.x_m - 60.0) < 5.0  # netconvert moves the origin to the lower left corner
+        assert abs(one.y_m - 60.0) < 5.0
 
 
 def bend_beside(
