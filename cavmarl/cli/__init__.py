@@ -140,6 +140,7 @@ _train(
     submit_train.submit_train,
     "cavmarl submit train ppo --config merge --to slurm --sbatch partition=long",
     "cavmarl submit train ppo --env town --to local --processes 2",
+    "cavmarl submit train ppo --env ./mytown --to service --secret-file ada.secret",
     ignore_unknown_options=True,
 )
 _train(
