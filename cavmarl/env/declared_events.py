@@ -53,6 +53,11 @@ class DeclaredEvents:
         """Return the commands with the declared events, which are kept until `clear`."""
         return replace(commands, declared=self._causes.copy()) if self._has_any else commands
 
+    def forget(self, chosen: NDArray[np.bool_]) -> None:
+        """Drop the declared events of the chosen worlds (W,), whose episode ends."""
+        self._causes[chosen] = 0
+        self._has_any = bool(self._causes.any())
+
     def clear(self) -> None:
         """Drop the declared events after the step that sent them."""
         if self._has_any:

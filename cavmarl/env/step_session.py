@@ -150,6 +150,7 @@ class StepSession:
     def forget(self, chosen: NDArray[np.bool_]) -> None:
         """Drop the last actions and the waiting inputs of the chosen worlds (W,)."""
         self.decoder.forget(chosen)
+        self.events.forget(chosen)
         self.insertions.forget(chosen)
         self.external.forget(chosen)
         self.overrides.forget(chosen)

@@ -128,6 +128,22 @@ def test_a_repeated_step_has_the_insertions_of_the_failed_step(
     assert found[0] == found[1]
 
 
+def test_an_event_that_was_declared_before_a_reset_is_dropped() -> None:
+    found = {}
+    for declared in ("never", "before", "after"):
+        with closing(parallel_env("merge", agents=2, overrides={"v2x.enabled": True})) as env:
+            env.reset(seed=2)
+            if declared == "before":
+                env.declare_event("car_0", "obstacle")
+            env.reset(seed=2)
+            if declared == "after":
+                env.declare_event("car_0", "obstacle")
+            env.step(env.suggest_actions())
+            found[declared] = env.state_hash()
+    assert found["before"] == found["never"]
+    assert found["after"] != found["never"]
+
+
 def interrupted(commands: Any) -> None:
     raise KeyboardInterrupt
 
