@@ -5,7 +5,7 @@
 The network first imitates the feedback controller, then learns from the rewards.
 
 Afterwards, worlds of other seeds run with the network, with the feedback controller and without
-control. The table has the mean time of a vehicle in the world or waiting to enter, and the number
+control. A table shows the mean time of a vehicle in the world or waiting to enter, and the number
 of arrived vehicles. The run's folder has stable-baselines3's `model.zip`, the figures as
 `evaluation.json`, and `manifest.json` with the conditions of the training.
 """

@@ -256,7 +256,7 @@ class Collector:
         return torch.cat([self._observations, proposed], dim=-1)
 
     def _heads(self, observations: Tensor, states: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the network's outputs for all seats, (W, A, …) and (W, A)."""
+        """Return the outputs of actor (W, A, …) and critic (W, A) for all agents of all worlds."""
         each = states[:, None].expand(*observations.shape[:2], states.shape[1])
         return self.network.heads(self.network.normal(observations), each)
 

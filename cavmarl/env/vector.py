@@ -35,7 +35,7 @@ MAX_WORLDS = 65_536
 Observations: TypeAlias = Any
 """(W, A, D) float32, or for each sensor of the rig an array (W, A, …)."""
 
-# With agents of signals, the first four are dicts with the keys `vehicles` and `signals`.
+# With agents beside the road, the first four items are dicts: `vehicles`, `signals` or `limits`.
 StepResult = tuple[Observations, Any, Any, Any, dict[str, Any]]
 
 
