@@ -363,7 +363,7 @@ class Learner:
             return torch.stack([policy_loss, value_loss, entropy.mean(), kl, clipped]).detach()
 
     def _filtered(self, advantages: Tensor, acted: Tensor, all_of_them: bool) -> Tensor:
-        """Return the rows with the largest absolute advantages (Cusumano-Towner et al. 2025)."""
+        """Return rows with the largest |advantages| (Cusumano-Towner et al. 2025), or all rows."""
         if all_of_them or self._args.keep == 1.0:
             return acted
         size = advantages[acted].abs()

@@ -85,7 +85,7 @@ def _end(road: Element, at_start: bool) -> RoadEnd:
 
 
 def _seal(road: Element, roads: dict[str, Element]) -> bool:
-    """Redraw a road over a junction if its lanes do not meet the lanes that it joins."""
+    """Redraw a road over a junction if it misses the lanes that it joins; return whether it did."""
     before, after = (
         roads.get(link.get("elementId", "")) if link is not None else None
         for link in (road.find("link/predecessor"), road.find("link/successor"))
