@@ -48,6 +48,6 @@ def is_lost(row: np.void) -> bool:
 
 @inlined_kernel
 def is_off_lanes(row: np.void) -> bool:
-    """Return whether a scripted vehicle is off its lane, which is its nearest or its last lane."""
+    """Return whether a vehicle `is_lost`, or is scripted and off the lane that its row names."""
     off: bool = row["driver"] == DRIVER_SCRIPTED and abs(row["d"]) > OFF_LANES_M
     return off or is_lost(row)
