@@ -522,7 +522,7 @@ def train(args: Args, console: Console) -> Path:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Train; return 0: trained, 2: wrong usage."""
+    """Train; return 0: trained, 2: an error, 130: interrupted."""
     message = "" if Ranks.of_torchrun().rank else options.DRIVER
     return options.run_program(lambda: train(parse_run(Args, words, __doc__), Console()), message)
 
