@@ -5,7 +5,7 @@
 The network first imitates the feedback controller, then learns from the rewards.
 
 Afterwards, worlds of other seeds run with the network, with the feedback controller and without
-control. The table has the mean time of a vehicle in the world or waiting to enter, and the number
+control. A table shows the mean time of a vehicle in the world or waiting to enter, and the number
 of arrived vehicles. The run's folder has stable-baselines3's `model.zip`, the figures as
 `evaluation.json`, and `manifest.json` with the conditions of the training.
 """
@@ -213,7 +213,7 @@ def train(args: Args) -> Path:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Train; return 0: trained, 2: wrong usage."""
+    """Train; return 0: trained, 2: an error, 130: interrupted."""
     return run_program(lambda: train(parse_run(Args, words, __doc__)), "trained: {folder}")
 
 

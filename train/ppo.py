@@ -256,7 +256,7 @@ class Collector:
         return torch.cat([self._observations, proposed], dim=-1)
 
     def _heads(self, observations: Tensor, states: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the network's outputs for all seats, (W, A, …) and (W, A)."""
+        """Return the outputs of actor (W, A, …) and critic (W, A) for all agents of all worlds."""
         each = states[:, None].expand(*observations.shape[:2], states.shape[1])
         return self.network.heads(self.network.normal(observations), each)
 
@@ -363,7 +363,7 @@ class Learner:
             return torch.stack([policy_loss, value_loss, entropy.mean(), kl, clipped]).detach()
 
     def _filtered(self, advantages: Tensor, acted: Tensor, all_of_them: bool) -> Tensor:
-        """Return the rows with the largest absolute advantages (Cusumano-Towner et al. 2025)."""
+        """Return rows with the largest |advantages| (Cusumano-Towner et al. 2025), or all rows."""
         if all_of_them or self._args.keep == 1.0:
             return acted
         size = advantages[acted].abs()
@@ -522,7 +522,7 @@ def train(args: Args, console: Console) -> Path:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Train; return 0: trained, 2: wrong usage."""
+    """Train; return 0: trained, 2: an error, 130: interrupted."""
     message = "" if Ranks.of_torchrun().rank else options.DRIVER
     return options.run_program(lambda: train(parse_run(Args, words, __doc__), Console()), message)
 

@@ -203,7 +203,7 @@ def train(args: Args) -> Path:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Train; return 0: trained, 2: wrong usage."""
+    """Train; return 0: trained, 2: an error, 130: interrupted."""
     return run_program(lambda: train(parse_settings(Args, words, __doc__)))
 
 

@@ -147,7 +147,7 @@ def _cell(values: Sequence[Any], runs: Runs) -> str:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Measure, or print the table; return 0: done, 2: wrong usage."""
+    """Measure, or print the table; return 0: done, 2: an error, 130: interrupted."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--maps", type=Path, help="RESCO's folder of maps")
     parser.add_argument("--seeds", type=int, nargs="+", default=[*range(5)], help="of the training")

@@ -18,6 +18,7 @@
     ├── CapacityError          more vehicles or agents than the world has room for
     ├── EvaluationError        a failed evaluation, or worlds that differ but must not
     │   └── ManifestError         results of unknown origin
+    ├── RecordingError         a recording that cannot be written or read
     ├── TrainingError          a training run that cannot start, continue or be written
     ├── ProtocolError          the hand-off protocol was violated, or cannot continue
     │   ├── LostTickError         a tick in which every process died
@@ -31,6 +32,7 @@
     ├── ClockError             a clock that is not advanced by its master
     ├── FollowerError          an external stack that sends invalid data
     │   └── FollowerLostError     a stack that has ended, or has not answered in time
+    ├── RosError               ROS cannot start or write, or has a second clock
     ├── ServiceError           the coordination service, one of its nodes, or a request failed
     ├── ZoneSimulatorError     another simulator that runs a zone cannot continue, or refuses
     └── SumoError              SUMO as global traffic cannot continue

@@ -8,4 +8,4 @@ from typing import Any, TypeAlias
 from numpy.typing import NDArray
 
 Zeros: TypeAlias = Callable[..., NDArray[Any]]
-"""A function with the arguments of `numpy.zeros`; unless processes share a world, `numpy.zeros`."""
+"""A function with the arguments of `numpy.zeros`; it may use huge pages or shared memory."""

@@ -87,7 +87,7 @@ class CompiledStep:
                 sequence.call(calls_of.settle)
 
     def _add_enter(self, sequence: CallSequence) -> None:
-        """Append the calls of `Tick.let_in`."""
+        """Append the calls of `Tick._enter`."""
         tick, calls = self._tick, self.group.departure_calls(self.departures)
         departures, worlds = self.departures, tick.worlds
         traffic = tick.traffic.calls(departures, worlds.ticks, worlds.keys, worlds.lanes)

@@ -23,7 +23,7 @@ from cavmarl.limits.limit_table import LimitTable, limit_rules
 from cavmarl.shards.shard import Commands
 from cavmarl.signals.kernels.green_choices import GREEN, HELD, KEEP, PREVIOUS, REFUSED, SINCE
 
-_MOST = 1 << 60  # ticks and sums in a saved state
+_MOST = 1 << 60  # limit of ticks and sums in a saved state
 
 
 class LimitComponent(Component):

@@ -86,7 +86,7 @@ class SumoPhases(OutsideTraffic):
         self._sumo.catch_up(worlds)
 
     def follow(self, tick: Tick) -> None:
-        """Step SUMO, then move its vehicles to their new places or remove them."""
+        """Step SUMO; if it drives the vehicles, move them to their new places or remove them."""
         self.callers.follow(tick)  # SUMO receives the new places of these vehicles
         sumo, departures, worlds, side = (
             self._sumo,

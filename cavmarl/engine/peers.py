@@ -20,6 +20,7 @@ class Peers:
     """Collective operations: each call returns when all processes have called it in the same tick.
 
     By default, there are no other processes: this process has all zones and exchanges nothing.
+    Rows have two buffers (`Shard.sides`); `side` is the index of the buffer in question.
 
     Attributes:
         are_none: whether this process runs all zones.

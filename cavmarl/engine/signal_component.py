@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from cavmarl.engine.component import ComponentContext
     from cavmarl.engine.v2x_component import V2xComponent
 
-_MOST = 1 << 40  # ticks and counts in a saved state
+_MOST = 1 << 40  # limit of ticks and counts in a saved state
 
 
 class SignalComponent:
@@ -112,7 +112,7 @@ class SignalComponent:
 
     @property
     def reads_all(self) -> tuple[str, ...]:
-        """`end` reads the vehicles of all zones before a decision, or always; `reset` always."""
+        """`reset` reads all zones; `end` does so if a decision is due or sensors need each tick."""
         decides: bool = self._sensing.reads_ticks or (self._ticks % self._decide_ticks == 0).any()
         return ("reset", "end") if decides else ("reset",)
 

@@ -67,7 +67,7 @@ class _Run:
 
 
 class SimulatorComponent(Component):
-    """Runs the simulators of zones, and the gate of the coordinators.
+    """Runs the simulators of zones, and tells coordinators which vehicles they refuse.
 
     Attributes:
         zones: the zones that simulators run, in this process or in others.
@@ -225,7 +225,7 @@ class SimulatorComponent(Component):
             self._ask(place, "run a tick", partial(self._take, place, run, wanted[place]))
 
     def sense(self, scenes: Sequence[SensedScene], turns: Sequence[Turn]) -> None:
-        """Write the samples of all turns: cavmarl's own, then samples of simulators with frames."""
+        """Write all due samples: cavmarl's own, then samples of simulators that give frames."""
         sense_here(scenes, turns)
         if not self._has_moved:  # at a reset, simulators have no vehicles yet
             return

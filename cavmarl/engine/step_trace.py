@@ -1,8 +1,9 @@
 """`StepTrace` records the order of the phases in a lock-step cycle of a co-simulation.
 
-The phases follow Algorithm 1 of the co-simulation paper: SUMO steps to t + Δt, its vehicles
-are mirrored, the world ticks exactly once, sensors deliver the frame of t + Δt, the stack computes
-u, and u is queued for the next cycle. Each part notes the name of its phase.
+The phases follow Algorithm 1 of the co-simulation paper (docs/explanation/papers.md): SUMO steps to
+t + Δt, its vehicles are mirrored, the world ticks exactly once, sensors deliver the frame of
+t + Δt, the external driving stack computes the controls u, and u is queued for the next cycle.
+Each part notes the name of its phase.
 """
 
 from __future__ import annotations

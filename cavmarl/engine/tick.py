@@ -116,7 +116,7 @@ class Tick:
             self.traffic.insert(self.departures, self.worlds, commands.inserted)
 
     def _advance(self, commands: Commands) -> None:
-        """Run advance → leave → exchange → resolve → enter → commit → signals."""
+        """Run advance → outside → leave → exchange → resolve → enter → commit → signals."""
         self.executor.advance(commands)
         self.outside.follow(self)
         self.leave()

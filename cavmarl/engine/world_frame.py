@@ -85,7 +85,7 @@ class FrameEvent(NamedTuple):
 
     tick: int  # tick of the later frame
     # departed, left, arrived, collision, off_road, wrong_way, red_light, out_of_time,
-    # transferred, signal; inserted and closed: changes by the caller
+    # transferred, signal; inserted, closed, opened, damaged, reversed: changes by the caller
     kind: str
     vehicle: int  # id; -1: no vehicle
     agent: int  # index; -1: no agent
@@ -131,7 +131,7 @@ def frame_of(
 
 
 def events_between(before: WorldFrame, after: WorldFrame) -> Iterator[FrameEvent]:
-    """Yield the events between two frames of an episode, in the order of vehicles."""
+    """Yield the events between two frames of an episode: the caller's, vehicles', signals'."""
     for kind, detail in after.asked:
         yield FrameEvent(after.tick, kind, -1, -1, detail)
     ids, were = after.vehicles["id"], before.vehicles["id"]

@@ -70,7 +70,7 @@ class World(NamedTuple):
     partition: ZonePartition
 
     def tell_tolerated(self) -> None:
-        """Log what was left out or replaced in the demand, with counts; once per call."""
+        """Log what was left out or replaced in the demand, with counts."""
         if self.demand is not None and self.demand.tolerated:
             lines = "\n".join(self.demand.tolerated)
             log.warning("%s: tolerated in the demand:\n%s", self.config.name, lines)

@@ -85,7 +85,7 @@ def load(
     for part in parts.attached:
         if isinstance(part, LaneComponent):
             part.renew_plans()
-    # The keys determine all orders. Orders that are due already are in the departure queue.
+    # The keys determine all departures of a demand file; those already due are in the queue.
     departures = parts.traffic.draw_orders(parts.departures, parts.worlds, everywhere)
     queue = next(rest)
     departures.queue[:, : queue.shape[1]] = queue
@@ -247,7 +247,7 @@ def _of_rerouting(parts: Parts) -> Iterator[Array]:
 
 
 def _put(target: Array, saved: Array) -> None:
-    """Copy the common part of two arrays; the room for an episode's orders grows on demand."""
+    """Copy the common part of two arrays, whose room for departures may differ."""
     shared = tuple(slice(min(pair)) for pair in zip(target.shape, saved.shape, strict=True))
     target[shared] = saved[shared]
 

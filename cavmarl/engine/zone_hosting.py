@@ -99,7 +99,7 @@ class ZoneHosting:
         vehicles: Sequence[NDArray[np.void]],  # VEHICLE (n,) of each world, of all zones
         contacts: NDArray[np.int64],  # (W,) number of contacts in all zones
     ) -> None:
-        """Change the zones if peers run some of the zones. Call `host_zones` afterwards."""
+        """Change the zones of worlds that peers run in part. Call `host_zones` afterwards."""
         tick = self._tick
         everywhere = np.ones(len(contacts), dtype=np.bool_)
         self.set_zones(partition)

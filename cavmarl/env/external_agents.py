@@ -46,7 +46,7 @@ class ExternalAgents:
         session: the session of one world; `population.external_agents` is true.
 
     Attributes:
-        ids: of all slots (E,).
+        ids: PettingZoo's ids of all slots (E,).
         shown: ids of the agents in the world after the last step.
     """
 

@@ -62,7 +62,7 @@ class SignalOverrides:
 
         Args:
             signal: id of the signal.
-            index: index of the links in the letters of the signal's phases.
+            index: position in the letters of the signal's phases; applies to all of its links.
             letter: one of `rugGysoOY`, SUMO's letters.
             world: number of the world.
 

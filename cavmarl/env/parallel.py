@@ -358,7 +358,7 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         The arrays are as in `SensorFrames`, without the axes of worlds and agents.
 
         Raises:
-            ActionError: there is no such agent, or it is a signal, which has no sensors.
+            ActionError: there is no such agent, or it is beside the road and has no sensors.
         """
         if agent not in self.possible_agents:
             raise self._no_agent(agent)

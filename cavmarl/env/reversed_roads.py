@@ -19,8 +19,8 @@ from cavmarl.roads.network import RoadNetwork
 # lanes are closed, and it opens once they are empty. QUEUED: still open, to be closed once the
 # reversed roads that lead to it are empty, so that their vehicles can leave.
 AS_ON_MAP, CLEARING, REVERSED_NOW, RETURNING, QUEUED = range(5)
-# Columns of `ReversedRoads.states`. KEPT: bits of the lanes that stay closed when a road returns;
-# for a CLEARING road, whether vehicles may be on its contraflow lanes.
+# Columns of `ReversedRoads.states`. _KEPT: bits of the lanes that stay closed when a road returns;
+# for a CLEARING road, not 0 if vehicles may be on its contraflow lanes.
 _STATE, _SINCE, _KEPT = range(3)
 _NOT_YET = -1  # the state begins in the next step
 
@@ -33,8 +33,8 @@ class ReversedRoads:
     """The states of the C roads of `map.contraflow` in W worlds.
 
     Attributes:
-        states: (W, C, 3) state of each road, the tick in which it began, and the bits of the lanes
-            that were closed while the road returns.
+        states: (W, C, 3) for each road: its state, the tick in which this state began, and bits
+            whose meaning depends on the state; see `_KEPT`.
     """
 
     def __init__(self, config: EnvConfig, network: RoadNetwork, num_worlds: int) -> None:
@@ -96,9 +96,9 @@ class ReversedRoads:
         return np.concatenate(found) if found else np.zeros(0, dtype=np.intp)
 
     def to_queue(self, world: int) -> list[str]:
-        """Return the closed roads to which other roads lead that are not yet ready to be reversed.
+        """Return the closed roads that must open again, because a road before them is not empty.
 
-        The closed roads have to open again, so that vehicles on the other roads can leave.
+        Otherwise, vehicles on the road before them could not leave it.
         """
         state = self.states[world, :, _STATE]
         waits = (self._before & ((state == QUEUED) | (state == CLEARING))).any(axis=1)
@@ -185,7 +185,7 @@ def _ground(network: RoadNetwork, edge: int) -> NDArray[np.intp]:
 
 
 def _roads_before(network: RoadNetwork, edges: Sequence[int]) -> NDArray[np.bool_]:
-    """Return (C, C), true where the second road leads to the first one, but not back to itself.
+    """Return (C, C), true where the second road leads to the first, which does not lead back.
 
     On a cycle of roads, no road waits for another.
     """

@@ -179,8 +179,8 @@ class RoadsideAgents(ABC):
         """Return the info of each agent of the first world.
 
         `decides`: whether its next action counts. `action_mask`: allowed choices, int8. `refused`:
-        number of choices in the episode that were not allowed. Then the index of the present
-        choice, and each term of the reward.
+        number of choices in the episode that were not allowed. The index of the present choice
+        has the key `self.choice`; each term of the reward has its own key.
         """
         arrays = self._arrays
         decides = int(arrays.signal_decides[0])
@@ -200,7 +200,7 @@ class RoadsideAgents(ABC):
         return found
 
     def infos_of_worlds(self) -> dict[str, NDArray[Any]]:
-        """Return the infos of a `CavVectorEnv`: `signal_mask` and others, or `limit_mask`."""
+        """Return the infos of a `CavVectorEnv`; their keys begin with `signal_` or `limit_`."""
         arrays, name = self._arrays, self.prefix
         return {
             f"{name}mask": arrays.signal_masks.copy(),

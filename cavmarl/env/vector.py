@@ -35,7 +35,7 @@ MAX_WORLDS = 65_536
 Observations: TypeAlias = Any
 """(W, A, D) float32, or for each sensor of the rig an array (W, A, …)."""
 
-# With agents of signals, the first four are dicts with the keys `vehicles` and `signals`.
+# With agents beside the road, the first four items are dicts: `vehicles`, `signals` or `limits`.
 StepResult = tuple[Observations, Any, Any, Any, dict[str, Any]]
 
 
@@ -257,9 +257,10 @@ class CavVectorEnv(WorldsEnvironment):
             observations (W, A, D), rewards (W, A), terminations (W, A): the vehicle's trip ended;
             truncations (W, A): the horizon of the episode or of the trip was reached; and infos:
             `mask` (W, A) agents that act next; `acted` (W, A) agents that acted in this step, so
-            their rewards count; `terms` (W, A, T) in the order of `config.terms.TERMS`;
-            `arrivals` (W,) vehicles that reached their goal since the reset, agents included;
-            `episode_over` (W,) worlds whose episode is over;
+            their rewards count; `vehicle_done` (W, A) agents whose vehicle's trip ended for any
+            reason; `terms` (W, A, T) in the order of `config.terms.TERMS`; `arrivals` (W,) vehicles
+            that reached their goal since the reset, agents included; `episode_over` (W,) worlds
+            whose episode is over;
             `final_observations` (W, A, D) observations before a reset, including the last ones of
             agents that left: the same array as the observations if no agent left in the step.
 
@@ -267,6 +268,7 @@ class CavVectorEnv(WorldsEnvironment):
             `vehicles`, and `signals` (W, S, …). Their infos are `signal_mask` (W, S, G) allowed
             choices, `signal_decides` (W,) whether the next choices count, `signal_terms`
             (W, S, T) and `signal_refused` (W, S) choices of the episode that were not allowed.
+            With agents of speed limits, the names have `limits` and `limit_` instead.
 
         Raises:
             EpisodeError: before the first reset, after `close`, or with `DISABLED` if a world's

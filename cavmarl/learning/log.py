@@ -168,7 +168,7 @@ def cut_logs(folder: Path, sizes: Mapping[str, int]) -> None:
 
 
 def read_rows(folder: Path) -> list[dict[str, float]]:
-    """Return the rows of a run's table so far, with six digits; empty if there is none."""
+    """Return the rows of a run's table, to six significant digits; empty without a table."""
     path = folder / CSV_FILE
     if not path.is_file():
         return []

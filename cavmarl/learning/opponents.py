@@ -17,7 +17,7 @@ Mask = NDArray[np.bool_]
 
 
 class Opponents:
-    """Fixed drivers, each for a random share of the agents, and drivers to imitate.
+    """Fixed drivers, each for about `share` of the agents, drawn at random; drivers to imitate.
 
     Attributes:
         absent: (W, A) agents of the learning driver, which have no opponent.

@@ -115,7 +115,7 @@ def check_device(name: str) -> None:
 
 
 def with_form_of(args: S, start: str) -> S:
-    """Return settings with the network form of a driver: `hidden`, `shared`, `residual`.
+    """Return settings with the network architecture of a driver: `hidden`, `shared`, `residual`.
 
     `start`: the driver's name or folder; empty: the settings are returned unchanged. Raises
     PolicyError: the driver does not exist, or is not a trained driver.

@@ -26,7 +26,7 @@ OF_OBSERVATIONS = (
 
 
 def begin_with(network: ActorCritic, config: NetworkConfig, folder: Path) -> int:
-    """Copy the weights of a driver into a network; return their number of training decisions.
+    """Copy a driver's weights into a network; return how many decisions the driver learned from.
 
     Observations that the driver does not have get the weight 0, so that the network first decides
     like the driver. Observations that the run does not have are left out and logged. The network
@@ -38,7 +38,7 @@ def begin_with(network: ActorCritic, config: NetworkConfig, folder: Path) -> int
         folder: folder of the driver.
 
     Raises:
-        PolicyError: the driver has another form.
+        PolicyError: the driver has another architecture or another kind of action.
     """
     driver, its_config = load_network(folder)
     held = driver.state_dict()

@@ -200,7 +200,7 @@ def _finite(place: tuple[float, ...]) -> tuple[float, float]:
 
 
 def _osm_buildings(path: Path, osm: _Reader, geo: GeoReference | None) -> Iterator[Footprint]:
-    """Yield the buildings among closed ways and multipolygons that are completely in the file."""
+    """Yield the buildings among closed ways and multipolygons; incomplete rings are left out."""
     for element in [*osm.ways.values(), *osm.relations]:
         if not element.is_building:
             continue

@@ -118,7 +118,7 @@ class BuildResult:
     defaults: tuple[RoadDefaults, ...] = ()  # missing values, from the type map
     notes: tuple[str, ...] = ()  # elements of the source that are not in the network, with counts
     heights: HeightReport | None = None
-    levels: int = 0  # number of lanes that cross on a bridge or in a tunnel; 0 with `heights`
+    levels: int = 0  # number of crossings of lanes on bridges or in tunnels; 0 with `heights`
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self) | {"path": str(self.path), "source": str(self.source)}
@@ -214,7 +214,7 @@ def build_network(
 
 
 def map_file(path: str | Path) -> Path:
-    """Return the SUMO network of a map file: the file itself, or the result of netconvert.
+    """Return the SUMO network of a map file: the file itself, or a cached network built from it.
 
     For a configuration of SUMO, this is the network that it names.
 

@@ -199,7 +199,7 @@ class OpenDriveSource:
         )
 
     def _set_limits_of_lanes(self, road: Element, of_road: Limits) -> Counter[float]:
-        """Return the default speeds in m/s of a road's lanes without a limit."""
+        """Write the limits of a road's lanes; count the default speeds in m/s that lanes get."""
         used: Counter[float] = Counter()
         sections = sorted(
             road.iterfind("lanes/laneSection"), key=lambda one: self._number(one, "s")

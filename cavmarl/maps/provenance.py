@@ -28,7 +28,7 @@ _GUESSED = {"lanes": "numLanes", "maxspeed": "speed", "width": "width"}
 
 @dataclass(frozen=True)
 class RoadDefaults:
-    """Values from netconvert's type map for roads of one kind without the tag."""
+    """A value of netconvert's type map, used for roads of one kind that do not state it."""
 
     kind: str  # OSM's `highway`, as named by netconvert; the type of a road of OpenDRIVE
     edges: int  # number of edges (OSM) or roads (OpenDRIVE)

@@ -22,7 +22,7 @@ STEP_M = 1.0  # distance between the compared places of a lane
 def shared_ground(network: RoadNetwork) -> list[tuple[int, int]]:
     """Return pairs of LANE rows that are closer than a car's width and have no right of way.
 
-    The lanes of a pair belong to two roads that do not lead to each other, to two junctions that do
+    The lanes of a pair belong to two roads and have no link between them, to two junctions that do
     not lead to each other, or to a road and a junction that are not connected.
     """
     grid = lane_grid(network)
@@ -79,7 +79,7 @@ def _owners(network: RoadNetwork) -> _Owners:
 
 
 def _are_apart(owners: _Owners, one: int, other: int) -> bool:
-    """Return whether two lanes belong to roads or junctions that do not lead to each other."""
+    """Return whether two lanes belong to different roads, or to places that are not connected."""
     inside, ground, before, beyond = owners
     if inside[one] != inside[other]:
         road, junction = (other, one) if inside[one] else (one, other)

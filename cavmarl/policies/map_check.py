@@ -19,7 +19,7 @@ class UntrainedMapWarning(RuntimeWarning):
 def meet_map(env: Environment, name: str, trained_on: Sequence[RoadKind]) -> OtherSide | None:
     """Warn about kinds of the map that a driver was not trained on.
 
-    Return the exchange of left and right, if the driver was trained on the other side of the road.
+    Return the exchange of left and right if the driver was trained on the other side; else None.
 
     Args:
         env: the environment.

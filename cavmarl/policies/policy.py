@@ -162,7 +162,7 @@ class SharedPolicy(Policy):
 
 
 def suggested(env: Environment) -> Any:
-    """Return the built-in driver's actions: (W, A, …) of a `CavVectorEnv`, or by id of agent."""
+    """Return the built-in driver's actions: an array (W, A, …), or for a `CavEnv` a dict."""
     found = env.suggest_actions()
     if isinstance(env, CavVectorEnv):
         return found[VEHICLES] if isinstance(found, dict) else found

@@ -181,7 +181,7 @@ _LAYOUT = re.compile(r"\[(\d+)([CFA])( readonly)?( unaligned)?\]")
 
 
 def type_key(argument: Any) -> Any:
-    """Return a value that is equal for two arguments if and only if their types are equal."""
+    """Return a value that is equal for two arguments only if their types are equal."""
     python = type(argument)
     if python is np.ndarray:
         return argument.dtype, argument.ndim, _FLAGS[argument.flags.num & _TYPED]

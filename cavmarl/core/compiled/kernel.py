@@ -144,8 +144,8 @@ def specialized(kernel: Callable[P, R], checks: bool = True) -> Callable[P, R]:
     The first call determines the types. A later call stores an argument, or an item of a bundle,
     only if it is another object than in the previous call. Each call therefore keeps its arguments
     alive until the next call. An argument of another type is a TypeError. Without `checks`, types
-    are not compared: for loops in which one process waits for another process, and for frames,
-    whose few callers ensure the types.
+    are not compared. This is for time-critical communication between processes, where the few
+    callers ensure the types.
 
     With `NUMBA_DISABLE_JIT=1`, this is the kernel itself.
     """

@@ -133,7 +133,7 @@ def cell_rows(grid: Grid, y: float, distance_m: float) -> tuple[int, int]:
 
 @kernel
 def move_area(grid: Grid, rows: NDArray[np.void], num: int) -> None:
-    """Move the area of a floating grid to where VEHICLE rows[:num] begin."""
+    """Let a floating grid begin at the smallest x and the smallest y of VEHICLE rows[:num]."""
     if not grid.floating or num == 0:
         return
     min_x = math.inf

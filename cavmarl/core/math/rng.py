@@ -6,7 +6,7 @@ generator gives a vehicle the same numbers in every shard, and after every resta
     key      64 bits   `world_key(seed, world, episode)`
     counter  word 0    vehicle, bits 0-31
              word 1    tick, bits 0-31
-             word 2    vehicle, bits 32-47, below tick, bits 32-47
+             word 2    low half: vehicle, bits 32-47; high half: tick, bits 32-47
              word 3    stream + draw index
 
 A caller that needs several numbers of one stream in one tick uses `STREAM_X`, `STREAM_X + 1`, …,

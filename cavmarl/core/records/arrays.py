@@ -147,7 +147,10 @@ class ZoneState(NamedTuple):
 
 
 class DepartureQueue(NamedTuple):
-    """Per-world data that is never divided: ids, the queue of departures, counts."""
+    """Per-world data that is never divided: ids, the queue of departures, counts.
+
+    D is the number of departures of a demand file, E the largest number of lanes of an edge.
+    """
 
     orders: NDArray[np.void]  # DEPARTURE (W, D) departures of a demand file, in order of `due`
     num_orders: NDArray[np.int64]  # (W,)
@@ -162,7 +165,7 @@ class DepartureQueue(NamedTuple):
     num_passing: NDArray[np.int64]  # (W,)
     places: NDArray[np.int64]  # (W, C + D) positions in the queue of vehicles that may enter
     tries: NDArray[np.int32]  # (W, C + D) LANE on which each queued vehicle tries to enter, or -1
-    ranks: NDArray[np.int64]  # (W, C + D, E) how crowded each lane of its edge is, at most E
+    ranks: NDArray[np.int64]  # (W, C + D, E) crowding of each lane of the departure's edge
     last_s: NDArray[np.float64]  # (W, C + D, E) position behind the last vehicle of these lanes, m
     lane_taken: NDArray[np.bool_]  # (L,) whether a vehicle tries to enter there in this tick
     spare: NDArray[np.void]  # VEHICLE (1,) scratch
@@ -216,8 +219,8 @@ class Scratch(NamedTuple):
     accel: NDArray[np.float64]  # (C,) decided accelerations
     link_ahead: NDArray[np.int32]  # (C,) the link at the next stop line of each row
     lane_change: NDArray[np.int32]  # (C,) decided lane changes: 1 left, -1 right, or STAYS_ASIDE
-    blinker: NDArray[np.int32]  # (C,)
-    hold: NDArray[np.int32]  # (C,)
+    blinker: NDArray[np.int32]  # (C,) new values of VEHICLE["blinker"]
+    hold: NDArray[np.int32]  # (C,) new values of VEHICLE["hold"]
     hit: NDArray[np.int64]  # (C,) id of the vehicle that each row touches
 
 

@@ -23,7 +23,7 @@ INSERT_NONE = 0
 INSERT_VEHICLE = 1
 
 # DEPARTURE["lane_code"]: the lane of its edge on which a vehicle enters, as SUMO's `departLane`.
-# Only open lanes count from which the vehicle can reach its goal.
+# Only lanes count that are open and from which the vehicle can reach its goal.
 LANE_GIVEN = 0
 LANE_FIRST = -1  # the lane nearest to the kerb
 LANE_RANDOM = -2
@@ -69,7 +69,8 @@ EVENT_OUT_OF_TIME = 32  # its trip has exceeded its time limit
 EVENTS_OF_FATE = EVENT_COLLIDED | EVENT_OFF_ROAD | EVENT_ARRIVED  # have priority over OUT_OF_TIME
 EVENTS_THAT_END = EVENTS_OF_FATE | EVENT_OUT_OF_TIME
 
-# VEHICLE["transfer"]: the only state in which a row is saved or sent
+# VEHICLE["transfer"]: the row is owned. Rows are saved and sent in this state only; others are
+# reserved.
 AUTHORITATIVE = 0
 
 # Letters of signals as codes: positions in roads.network.SIGNAL_STATES = "rugGysoOY".

@@ -16,7 +16,7 @@ FIRST_EXTERNAL_ID = (1 << 40) + (1 << 30)
 
 
 def first_external_id(tick: int, slots: int) -> int:
-    """Return the id of a vehicle that enters the first of `slots` slots in a tick."""
+    """Return the id of a vehicle that enters slot 0 in a tick; `slots`: number of all slots."""
     return FIRST_EXTERNAL_ID + int(tick) * slots
 
 

@@ -39,7 +39,7 @@ def is_steered(row: np.void) -> bool:
 def is_lost(row: np.void) -> bool:
     """Return whether a steered vehicle or a vehicle of the caller is on no lane.
 
-    Vehicles on the lane in its row, which is its last or its nearest lane, ignore it.
+    Its row names its last or its nearest lane; vehicles on that lane ignore it.
     """
     is_free: bool = is_steered(row) or row["driver"] == DRIVER_EXTERNAL
     lost: bool = abs(row["d"]) > LOST_M and is_free
@@ -48,6 +48,6 @@ def is_lost(row: np.void) -> bool:
 
 @inlined_kernel
 def is_off_lanes(row: np.void) -> bool:
-    """Return whether a scripted vehicle is off its lane, which is its nearest or its last lane."""
+    """Return whether a vehicle `is_lost`, or is scripted and off the lane that its row names."""
     off: bool = row["driver"] == DRIVER_SCRIPTED and abs(row["d"]) > OFF_LANES_M
     return off or is_lost(row)

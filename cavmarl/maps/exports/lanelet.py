@@ -47,8 +47,8 @@ def write_lanelet2(network: RoadNetwork, target: Path, is_local: bool = False) -
     `is_local`: the file is read by `local_x` and `local_y`, so the map needs no projection.
 
     Raises:
-        MapError: the map has no projection, the target cannot be written, or the number of lanelets
-            read back differs.
+        MapError: the map has no projection, the target cannot be written, or the numbers of
+            lanelets or regulatory elements read back differ.
         MissingExtraError: lanelet2 or pyproj is not installed.
     """
     if network.geo is None and not is_local:

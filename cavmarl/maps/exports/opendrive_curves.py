@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from cavmarl.maps.exports.opendrive_lanes import LANES, part_roads
 
 _SEALED_M = 1e-3  # maximum gap between lanes that lead into each other
-_SAME_RAD = 1e-4  # 2 mm at the outermost lane of a wide road, 20 m from the reference line
+_SAME_RAD = 1e-4  # tolerance of directions: 2 mm at a distance of 20 m from the reference line
 _PIVOT_M = 0.5  # a shorter line for a U-turn is moved to the other side of its lane
 _SAME_GRADE = 1e-6
 _PARTS = 64  # a length is the sum over this many parts: some curves nearly have a cusp
@@ -85,7 +85,7 @@ def _end(road: Element, at_start: bool) -> RoadEnd:
 
 
 def _seal(road: Element, roads: dict[str, Element]) -> bool:
-    """Redraw a road over a junction if its lanes do not meet the lanes that it joins."""
+    """Redraw a road over a junction if it misses the lanes that it joins; return whether it did."""
     before, after = (
         roads.get(link.get("elementId", "")) if link is not None else None
         for link in (road.find("link/predecessor"), road.find("link/successor"))

@@ -43,7 +43,7 @@ class Comparison:
     alignment: Alignment | None  # None: compared without alignment
     distance_m: Points  # (n,) distance of each point of P to its nearest point of Q
     reverse_m: Points  # distance of each point of Q to its nearest point of P
-    transform: Points  # (4, 4) transform of P, including the start
+    transform: Points  # (4, 4) transform of P: `start`, then the alignment
 
     @property
     def aligned(self) -> Points:

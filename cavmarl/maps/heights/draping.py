@@ -140,7 +140,7 @@ def raise_levels(document: NetDocument, roads: OsmRoads, source: Path) -> int:
         source: source of the map, for messages.
 
     Returns:
-        The number of lanes that cross on two levels.
+        The number of crossings of lanes on two levels.
 
     Raises:
         MapError: an end of a bridge or tunnel cannot be projected.

@@ -124,7 +124,7 @@ def _links(
 
 
 def _beside(lanes: tuple[DocumentLane, ...], plane_m: Points, first: Rows) -> list[Rows]:
-    """Return pairs of adjacent places on lanes of one edge, which have the same height."""
+    """Return pairs of places that are side by side on neighbouring lanes of one edge."""
     pairs = []
     window = np.arange(-_BESIDE, _BESIDE + 1)
     for lane, (one, other) in enumerate(pairwise(lanes)):

@@ -39,7 +39,7 @@ MOST_SAMPLES = 10_000_000  # limit of all tracks; in a pickle, tracks may share 
 GPUDRIVE_STEP_S = 0.1  # not stated in the file; Waymo's motion data set has 10 Hz
 _MOVING_MPS = 2.0  # above this speed, the heading fits the direction of the motion
 _ALONG_COS, _MOST_MISFITS = 0.97, 0.05  # 14°; allowed share of points beyond this angle
-# Waymo states the first two, and nuPlan the last one.
+# Units of `speed_limit_UNIT`: Waymo states the first two, and nuPlan the last one.
 _MPS_PER_UNIT = (("kmh", 1.0 / 3.6), ("mph", 0.44704), ("mps", 1.0))
 _SIZES_M = {"vehicle": (4.5, 1.9, 1.6), "pedestrian": (0.5, 0.5, 1.75), "cyclist": (1.8, 0.7, 1.7)}
 _GPUDRIVE_FREEWAY, _GPUDRIVE_BIKE_LANE = 1, 3  # map_element_id

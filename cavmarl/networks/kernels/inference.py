@@ -48,8 +48,8 @@ def evaluate_network(
 ) -> None:
     """Evaluate a network for rows of observations.
 
-    The result of a row does not depend on the other rows. For the size of `buffers`, a GRU
-    layer has three numbers per unit, and the widest layer has at least PARTIAL_SUMS numbers.
+    The result of a row does not depend on the other rows. In the size of `buffers`, the width of
+    a GRU layer is three times its units, and the widest layer counts as at least PARTIAL_SUMS wide.
     """
     num_inputs = layers[0, 1]
     num_outputs = layers[layers.shape[0] - 1, 2]

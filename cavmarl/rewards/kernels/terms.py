@@ -48,7 +48,7 @@ def _progress(row: np.void, step_s: float) -> float:
 
 @kernel
 def _speeding(roads: RoadArrays, row: np.void) -> float:
-    """Return the speed above the lane's limit / the limit; `delay` covers lower speeds."""
+    """Return the excess over the lane's limit, divided by the limit; `delay` covers low speeds."""
     return float(max(row["speed"] / roads.lanes[row["lane"]]["speed_mps"] - 1.0, 0.0))
 
 

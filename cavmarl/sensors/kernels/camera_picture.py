@@ -210,8 +210,8 @@ def find_faces(camera: CameraPose, panorama: Panorama, counts: Counts, picture: 
 def look(camera: CameraPose, picture: PixelRows, num: int, first: int, last: int) -> None:
     """Render the rows [first, last) of a picture.
 
-    `picture`: contains the faces; its rows are overwritten, starting with the first. `num`: number
-    of faces. `last`: at most `first` plus the number of rows of `picture`.
+    `picture`: contains the faces; its rows are overwritten, and its row 0 becomes row `first`.
+    `num`: number of faces. `last`: at most `first` plus the number of rows of `picture`.
     """
     _clear(camera, picture, first, last)
     draw_faces(picture, num, first, last)

@@ -4,8 +4,8 @@ The sectors do not turn with the vehicle: the centre of cell k lies k steps cloc
 frame of `vehicle_features`). The sensor copies highway-env, so it differs from `lidar`, whose rays
 intersect bodies exactly and turn with the vehicle. A vehicle is seen if its centre is in range. It
 is also drawn into the cell of its centre, at the distance of the centre minus half the vehicle's
-width. Inside a body, distances are negative. Speeds, like distances, are divided by the range in
-metres. In empty cells, distance and speed are equal to the range.
+width. Inside a body, distances are negative. In empty cells, distance and speed are equal to the
+range. With `normalize`, distances and speeds are then divided by the range in metres.
 """
 
 from __future__ import annotations

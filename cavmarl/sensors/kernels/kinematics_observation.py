@@ -1,8 +1,8 @@
 """highway-env's `KinematicObservation`: a table of nearby vehicles and their features.
 
-The table shows vehicles within `PERCEPTION_M` and at most two ego lengths behind, ordered by
-distance along the ego lane, which is extended straight beyond its ends. The first row is the ego
-vehicle, always in the world's frame.
+The table shows vehicles within `PERCEPTION_M` and, without `see_behind`, at most two ego lengths
+behind. Unless shuffled, they are ordered by distance along the ego lane, which is extended straight
+beyond its ends. The first row is the ego vehicle, always in the world's frame.
 
 `vehicle_features` returns the numbers of highway-env's `Vehicle.to_dict`. Their frame is that of
 highway-env's pictures: x points right (east), y points down (south), and headings turn clockwise.

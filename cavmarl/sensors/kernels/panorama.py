@@ -88,10 +88,10 @@ class Panorama(NamedTuple):
     prisms: NDArray[np.void]  # PRISM (C,)
     order: NDArray[np.int32]  # (C,) prisms by id
     walls: NDArray[np.void]  # WALL (num_walls,)
-    roofs: NDArray[np.float64]  # (num_roofs, 4, 2)
-    roof_height: NDArray[np.float64]  # (num_roofs,)
-    strips: NDArray[np.float64]  # (num_strips, 4, 2)
-    lined: NDArray[np.float64]  # (num_strips,)
+    roofs: NDArray[np.float64]  # (num_roofs, 4, 2) corners of buildings' convex parts, m
+    roof_height: NDArray[np.float64]  # (num_roofs,) m
+    strips: NDArray[np.float64]  # (num_strips, 4, 2) corners of pieces of lanes, m
+    lined: NDArray[np.float64]  # (num_strips,) 1 if the strip's sides are lane lines, else 0
 
 
 class Counts(NamedTuple):

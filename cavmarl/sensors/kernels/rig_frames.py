@@ -1,8 +1,8 @@
 """Common parts of mounted sensors: poses, errors, sampling times, counts, and lost samples.
 
 The sampling schedule is a pure function of a world's tick: sample k is due k · ticks / samples
-ticks after the phase, and the first tick at or after that time delivers it. So the schedule has no
-state that a migration, reset or repeated tick could change.
+ticks after tick `phase`, and the first tick at or after that time delivers it. So the schedule has
+no state that a migration, reset or repeated tick could change.
 
 Frames are right-handed: x forward, y left, z up. An orientation is given by yaw (counter-clockwise
 seen from above), then pitch (positive upwards), then roll (positive with the left side up), each
