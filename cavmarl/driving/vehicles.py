@@ -1,10 +1,10 @@
 """`VEHICLE`: the complete state of one vehicle, as one record.
 
-A shard has one array of these records: owned rows first, then ghosts. A migration is a row
-assignment, a snapshot is a copy, a halo is a slice, and the wire format is the bytes of the
-records. So the record contains more than the next tick needs: ownership, random stream, sensor
-phase and return move with the row. The delayed commands of agents are stored separately, in
-`Worlds.pending`: most vehicles have none, and every tick copies the rows.
+A shard (the part of a world in one zone) has one array of these records: rows that the zone owns,
+then ghosts (copies of rows of other zones). A vehicle moves to another zone as a copy of its
+record, and messages contain the bytes of records. So a record contains more than the next tick
+needs: ownership, random stream, sensor phase and return. The delayed commands of agents are stored
+in `Worlds.pending`: most vehicles have none, and every tick copies the rows.
 
 Frames are as in `roads.network`: x, y, z is the centre of the body; the heading is
 counter-clockwise from east; `s` and `d` are the centre's position on the lane, d positive to the

@@ -151,7 +151,7 @@ class Bus:
         """Send the messages due in the current tick, and receive arriving messages.
 
         Args:
-            side: side of the zones' rows that holds the committed rows.
+            side: 0 or 1, the half of `ZoneState.rows` with the state at the current tick.
 
         Raises:
             ConfigError: the channel is external, and either no network simulator is connected or

@@ -237,8 +237,8 @@ def stop_back(
         ways: (K,) the paths plus some metres of the lanes at both ends.
 
     Returns:
-        (L,), 0 if no path from another lane comes near. If `MOST_M` is not enough, the map's stop
-        line is kept.
+        (L,), 0 if no path from another lane comes near, or if a line would have to move back more
+        than `MOST_M`.
     """
     back = np.zeros(len(ends))
     at: dict[int, list[int]] = defaultdict(list)
