@@ -67,7 +67,8 @@ LANE = record(
     ("speed_mps", np.float64),  # speed limit
     ("width_m", np.float64),
     ("internal", np.bool_),  # inside a junction
-    # whether vehicles that turn into the road at the lane's end yield to vehicles within `MERGES_M`
+    # whether vehicles that turn into the road at the lane's end yield to vehicles on this lane that
+    # are within `records.rows.MERGES_M`
     ("merges", np.bool_),
     ("left", np.int32),  # LANE row of the left neighbour in the same direction
     ("right", np.int32),

@@ -360,7 +360,8 @@ def fill_conflicts(
 ) -> None:
     """Write the conflicts of each LINK, and its waiting position in the junction, into `links`.
 
-    Also set `merges` of lanes at whose end vehicles may turn into the road without having to stop.
+    Also set `merges` of lanes whose vehicles have the right of way over vehicles that merge with
+    them without a signal, except at all-way stops.
     """
     links["first_conflict"] = first_conflict[:-1]
     links["num_conflicts"] = np.diff(first_conflict)
