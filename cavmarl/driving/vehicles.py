@@ -79,7 +79,7 @@ VEHICLE = np.dtype(
         # scripted vehicles, the current FRAME
         ("goal", np.int32),
         ("leg", np.int32),  # number of previous routes
-        # DEPARTURE row of the demand file, or slot of a caller's vehicle; -1: made by the generator
+        # DEPARTURE row of the demand file, number in SUMO, or slot of a caller's vehicle; -1: none
         ("order", np.int32),
         ("departed", np.int64),  # tick of insertion
         ("due", np.int64),  # tick at which an agent's trip is cut off; -1: none
@@ -89,7 +89,7 @@ VEHICLE = np.dtype(
         ("target_zone", np.int32),
         ("epoch", np.int32),  # number of changes of owner
         ("transfer", np.int32),  # AUTHORITATIVE; other values are reserved
-        # agents' vehicles only
+        # memory; sensor_phase and episode_return: agents' vehicles only
         ("sensor_phase", np.int32),  # ticks until slow sensors fire; reserved: all fire each step
         ("episode_return", np.float64),  # sum of rewards since the agent got this vehicle
         # time stopped on the current lane: LANE · 2³² + ticks; -1: not counted (`lane_counts`)

@@ -682,7 +682,7 @@ def _capacity(
     dt: float,
     horizon_s: float,
 ) -> int:
-    """Return the number of ordered vehicles, at most the number that fit on the map."""
+    """Return the rows for own vehicles, and for the ordered vehicles (and a reserve) that fit."""
     own = _own_vehicles(population)
     if schedule is None or not len(schedule.demand.types):
         return own
