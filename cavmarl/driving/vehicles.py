@@ -79,7 +79,7 @@ VEHICLE = np.dtype(
         # scripted vehicles, the current FRAME
         ("goal", np.int32),
         ("leg", np.int32),  # number of previous routes
-        # DEPARTURE row of the demand file, number in SUMO, or slot of a caller's vehicle; -1: none
+        # DEPARTURE row of a demand file, SUMO's number, or a caller's slot; -1: of the generator
         ("order", np.int32),
         ("departed", np.int64),  # tick of insertion
         ("due", np.int64),  # tick at which an agent's trip is cut off; -1: none

@@ -14,7 +14,7 @@ def horizon_of(network: RoadNetwork) -> float:
     """Return `CROSSINGS` times the duration in s of a drive over the map's width plus its height.
 
     The assumed speed is the mean speed of a car that drives every lane once at the speed limit. The
-    result is rounded to tens and limited to [60, 900]. Of several maps, the slowest counts.
+    result is rounded to tens and limited to [60, 900]. Of several maps, the longest result counts.
     """
     return max(_horizon_on(network, number) for number in range(len(network.maps)))
 

@@ -682,7 +682,7 @@ def _capacity(
     dt: float,
     horizon_s: float,
 ) -> int:
-    """Return the rows for own vehicles, and for the ordered vehicles (and a reserve) that fit."""
+    """Return the number of rows: own vehicles, and as many ordered ones as fit on the map."""
     own = _own_vehicles(population)
     if schedule is None or not len(schedule.demand.types):
         return own

@@ -84,7 +84,7 @@ from cavmarl.driving.kernels.models.following import before_line, no_constraint,
 from cavmarl.driving.kernels.motion.ordered_stops import distance_to_stop
 from cavmarl.driving.kernels.motion.speed_limits_ahead import bend_speed, speed_before_limit
 
-SEE_LINE_M = 12.0  # at rest, a driver sees lines up to here; swept areas begin up to 10.5 m earlier
+SEE_LINE_M = 12.0  # at rest, a driver sees lines up to here; areas are swept up to 10.5 m before
 CLOSER_M = 0.9  # a driver that resolves deadlocks stops this much closer than `LINE_MARGIN_M`
 # Around a corner, if the gap to the leader is below `NEAR_M` and the headings differ by more than
 # `ASKEW_RAD`, half the leader's width is subtracted from the gap.

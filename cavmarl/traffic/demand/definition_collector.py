@@ -203,7 +203,7 @@ class DefinitionCollector:
 
     def _name(self, kind: str, element: Element) -> None:
         name = element.text("id")
-        # Types and type distributions have common ids, and so have routes and their distributions.
+        # An id may name either a type or a type distribution; the same applies to routes.
         for other in (kind, f"{kind}Distribution", kind.removesuffix("Distribution")):
             known = self.named.get(other, {}).get(name)
             if known is not None:

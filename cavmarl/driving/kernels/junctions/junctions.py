@@ -143,7 +143,7 @@ def _hold_for_foes(
 
 @inlined_kernel
 def _stops_all(signal: int) -> bool:
-    """Return whether vehicles that are still before the junction before this signal must stop."""
+    """Return whether a signal is red or yellow, so that it stops all vehicles one junction away."""
     red = signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW
     return red or signal == SIGNAL_YELLOW_MINOR or signal == SIGNAL_YELLOW_MAJOR
 
