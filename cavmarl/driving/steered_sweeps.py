@@ -1,9 +1,9 @@
 """Swept areas of steered cars, for the maps of worlds with agents.
 
 Background vehicles have both bumpers on their paths. A steered car, whose axles are at its bumpers,
-turns late and drives with its front outside and its rear inside of a bend. So a car is driven over
-each link once, and SWEEP rows describe where it meets vehicles on other links. Only the built-in
-drivers of agents' vehicles read these rows.
+turns late and drives with its front outside and its rear inside of a bend. So this module drives a
+car over the links in advance, and describes in SWEEP rows where it meets vehicles on other links.
+Only the built-in drivers of agents' vehicles read these rows.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ class _Drive:
         self._poses = np.empty((MOST_POSES, 6))
 
     def poses(self, link: int) -> NDArray[np.float64]:
-        """Return the poses (n, 6) of the car on a link, as `poses_on_rails` does."""
+        """Return the poses (n, 6) of the car on a link, in the form of `poses_on_rails`."""
         network, lane = self._network, int(self._network.links["from_lane"][link])
         self._plan["next"][0, lane] = network.links["first_internal"][link]
         self._plan["link"][0, lane] = link

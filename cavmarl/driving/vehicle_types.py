@@ -153,7 +153,7 @@ DEFAULT_TYPES = {
 
 
 class AgentType(NamedTuple):
-    """Values of a type of agents' vehicles that differ from the car; units as in `VTYPE`."""
+    """A type that agents or the caller may use besides the car; units as in `VTYPE`."""
 
     vclass: str
     length: float

@@ -1,10 +1,10 @@
 """`VEHICLE`: the complete state of one vehicle, as one record.
 
-A shard has one array of these records: owned rows first, then ghosts. A migration is a row
-assignment, a snapshot is a copy, a halo is a slice, and the wire format is the bytes of the
-records. So the record contains more than the next tick needs: ownership, random stream, sensor
-phase and return move with the row. The delayed commands of agents are stored separately, in
-`Worlds.pending`: most vehicles have none, and every tick copies the rows.
+A shard (the part of a world in one zone) has one array of these records: rows that the zone owns,
+then ghosts (copies of rows of other zones). A vehicle moves to another zone as a copy of its
+record, and messages contain the bytes of records. So a record contains more than the next tick
+needs: ownership, random stream, sensor phase and return. The delayed commands of agents are stored
+in `Worlds.pending`: most vehicles have none, and every tick copies the rows.
 
 Frames are as in `roads.network`: x, y, z is the centre of the body; the heading is
 counter-clockwise from east; `s` and `d` are the centre's position on the lane, d positive to the
@@ -79,7 +79,7 @@ VEHICLE = np.dtype(
         # scripted vehicles, the current FRAME
         ("goal", np.int32),
         ("leg", np.int32),  # number of previous routes
-        # DEPARTURE row of the demand file, or slot of a caller's vehicle; -1: made by the generator
+        # DEPARTURE row of a demand file, SUMO's number, or a caller's slot; -1: of the generator
         ("order", np.int32),
         ("departed", np.int64),  # tick of insertion
         ("due", np.int64),  # tick at which an agent's trip is cut off; -1: none
@@ -89,7 +89,7 @@ VEHICLE = np.dtype(
         ("target_zone", np.int32),
         ("epoch", np.int32),  # number of changes of owner
         ("transfer", np.int32),  # AUTHORITATIVE; other values are reserved
-        # agents' vehicles only
+        # memory; sensor_phase and episode_return: agents' vehicles only
         ("sensor_phase", np.int32),  # ticks until slow sensors fire; reserved: all fire each step
         ("episode_return", np.float64),  # sum of rewards since the agent got this vehicle
         # time stopped on the current lane: LANE · 2³² + ticks; -1: not counted (`lane_counts`)

@@ -65,7 +65,7 @@ _TEXTS = (
 
 
 def load_network(path: str | Path) -> RoadNetwork:
-    """Read a network through the cache beside the compiled kernels; rebuild damaged entries.
+    """Read a network through the cache (folder `maps` in `cache_dir`); rebuild damaged entries.
 
     Raises MapError: see `read_network`.
     """

@@ -6,15 +6,15 @@ import numpy as np
 
 from cavmarl.roads.network import CARS, RoadNetwork
 
-CROSSINGS = 3.0  # factor on the free-flow time of a trip across the map; traffic is slower
+CROSSINGS = 3.0  # factor on the time of a drive across the empty map; traffic is slower
 LEAST_S, MOST_S, ROUND_S = 60.0, 900.0, 10.0
 
 
 def horizon_of(network: RoadNetwork) -> float:
-    """Return the duration in s of three trips along the width and the height of the map.
+    """Return `CROSSINGS` times the duration in s of a drive over the map's width plus its height.
 
     The assumed speed is the mean speed of a car that drives every lane once at the speed limit. The
-    result is rounded to tens and limited to [60, 900]. For several maps, the longest one is used.
+    result is rounded to tens and limited to [60, 900]. Of several maps, the longest result counts.
     """
     return max(_horizon_on(network, number) for number in range(len(network.maps)))
 

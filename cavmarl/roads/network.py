@@ -67,7 +67,8 @@ LANE = record(
     ("speed_mps", np.float64),  # speed limit
     ("width_m", np.float64),
     ("internal", np.bool_),  # inside a junction
-    # whether vehicles that turn into the road at the lane's end yield to vehicles within `MERGES_M`
+    # whether vehicles that turn into the road at the lane's end yield to vehicles on this lane that
+    # are within `records.rows.MERGES_M`
     ("merges", np.bool_),
     ("left", np.int32),  # LANE row of the left neighbour in the same direction
     ("right", np.int32),
@@ -127,7 +128,7 @@ LINK = record(
     ("may_block", np.bool_),  # vehicles enter without room beyond the junction (keepClear="0")
     ("first_conflict", np.int32),  # CONFLICT rows, sorted by the foe's LINK row
     ("num_conflicts", np.int32),
-    ("first_sweep", np.int32),  # SWEEP rows, sorted by the foe's LINK row and sizes
+    ("first_sweep", np.int32),  # SWEEP rows, sorted by `own`, then by the foe's LINK row
     ("num_sweeps", np.int32),
     ("swept_by", np.int32),  # the smallest size class of vehicles that sweep over cars on this link
     ("swept_m", np.float64),  # up to here, rears may sweep over other lanes; m from the stop line
@@ -145,7 +146,7 @@ CONFLICT = record(
 )
 
 SWEEP = record(
-    ("foe", np.int32),  # LINK of the same junction, but from another lane
+    ("foe", np.int32),  # LINK of the same junction; a U-turn is also a foe of its own lane's links
     ("own", np.int32),  # size class (`SIZE_LENGTHS_M`) of the vehicle on this link
     ("other", np.int32),  # size class of the vehicle on the foe's path
     # distances from the stop line at which a front begins, and a rear ceases, to obstruct the foe;
@@ -347,7 +348,7 @@ class RoadNetwork:
 
     @property
     def num_controllers(self) -> int:
-        """Number of actuated programs; each has a state in every world."""
+        """Number of programs with a state in every world: actuated, or controlled by an agent."""
         return int((self.programs["controller"] >= 0).sum())
 
     @cached_property

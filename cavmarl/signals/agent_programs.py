@@ -178,5 +178,5 @@ def between_greens(before: str, after: str) -> str:
 
 
 def _all_red(before: str, after: str) -> str:
-    """Return the letters of the all-red phase; links without a signal phase keep their letter."""
+    """Return the letters of the all-red phase; links whose signal is off (o, O) stay off."""
     return "".join(old if old in "oO" else "r" for old in before)

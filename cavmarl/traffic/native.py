@@ -140,7 +140,7 @@ class NativeTraffic:
             "calls",
             "lane_plans",
             "changed_at",
-        ):  # kept per world
+        ):  # these depend on the number of worlds
             vars(other).pop(name, None)
         other._check_room()
         return other
@@ -342,7 +342,7 @@ class NativeTraffic:
 
     @property
     def own_plan_steps(self) -> range:
-        """Number of steps of the worlds' own plans, which SUMO's routes follow."""
+        """Rows of the steps of the worlds' own plans; SUMO's routes come after them."""
         return range(self._first_own, self._first_own + self._own_steps)
 
     def _with_room(self, fixed: NDArray[np.void]) -> NDArray[np.void]:
@@ -682,7 +682,7 @@ def _capacity(
     dt: float,
     horizon_s: float,
 ) -> int:
-    """Return the number of ordered vehicles, at most the number that fit on the map."""
+    """Return the number of rows: own vehicles, and as many ordered ones as fit on the map."""
     own = _own_vehicles(population)
     if schedule is None or not len(schedule.demand.types):
         return own

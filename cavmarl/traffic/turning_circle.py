@@ -45,7 +45,7 @@ CAR_BODY = TurningBody(5.0, 2.0, 5.0, np.inf)
 def with_tight_turns(
     network: RoadNetwork, steering_rad: float, bodies: tuple[TurningBody, ...] = (CAR_BODY,)
 ) -> RoadArrays:
-    """Mark turns that one of the `bodies` cannot take as U-turns, so that plans avoid them.
+    """Mark as U-turns all turns that are too tight for one of the `bodies`, so plans avoid them.
 
     `steering_rad`: maximum angle of the front wheels. If a lane itself turns too tightly, all links
     to and from it are marked.

@@ -151,11 +151,11 @@ class Bus:
         """Send the messages due in the current tick, and receive arriving messages.
 
         Args:
-            side: side of the zones' rows that holds the committed rows.
+            side: 0 or 1, the half of `ZoneState.rows` with the state at the current tick.
 
         Raises:
-            ConfigError: the channel is external, and either no network simulator is connected or
-                its answer is invalid.
+            ConfigError: the channel is external, but no network simulator is connected.
+            MessageError: the answer of the network simulator is invalid.
         """
         num_worlds = len(self._common.ticks)
         if not self._config.channel.external:

@@ -1,4 +1,4 @@
-"""Drivers: the acceleration and the lane change of each vehicle, from the committed state alone.
+"""Drivers: the acceleration and the lane change of each vehicle, from the state before the tick.
 
 Accelerations follow the car-following model of the vehicle's type, lane changes follow MOBIL. This
 file finds the inputs of these models:
@@ -84,7 +84,7 @@ from cavmarl.driving.kernels.models.following import before_line, no_constraint,
 from cavmarl.driving.kernels.motion.ordered_stops import distance_to_stop
 from cavmarl.driving.kernels.motion.speed_limits_ahead import bend_speed, speed_before_limit
 
-SEE_LINE_M = 12.0  # used for stopped vehicles: swept areas begin up to 10.5 m before a line
+SEE_LINE_M = 12.0  # at rest, a driver sees lines up to here; areas are swept up to 10.5 m before
 CLOSER_M = 0.9  # a driver that resolves deadlocks stops this much closer than `LINE_MARGIN_M`
 # Around a corner, if the gap to the leader is below `NEAR_M` and the headings differ by more than
 # `ASKEW_RAD`, half the leader's width is subtracted from the gap.
@@ -360,10 +360,10 @@ def _prefetch_further(roads: RoadArrays, step: np.void, scratch: Scratch) -> Non
 def decide(
     roads: RoadArrays,
     travel: TripTables,
-    rows: NDArray[np.void],  # VEHICLE (C,), the committed state; read-only
+    rows: NDArray[np.void],  # VEHICLE (C,), the state before the tick; read-only
     num: int,  # decide for the first `num` rows; the lane and link indices contain all rows
     driver: int,  # only for rows with this DRIVER_*
-    tick: int,  # tick of the committed state
+    tick: int,  # tick of this state
     dt: float,  # s for which a decision is valid: a tick, or an agent's step
     phase: NDArray[np.int32],  # (num_signals,) active PHASE rows
     step: NDArray[np.void],  # (C,) the PLAN of each row's lane

@@ -28,13 +28,13 @@ WALL = record(
 class Backdrop(NamedTuple):
     """The static objects of a map in its frame, and the semantic classes of vehicle types.
 
-    Objects are sorted by the cells of their centres. Indices use only `start` and `largest`, half
-    of the largest extent. Corners of a strip: right start, left start, left end, right end.
+    Objects are sorted by the cells of their centres; `largest` of a Grid is half of the largest
+    extent of an object. Corners of a strip: right start, left start, left end, right end.
     """
 
     semantics: NDArray[np.uint8]  # (num_types,) semantic class of each VTYPE row
     strips: NDArray[np.float64]  # (num_strips, 4, 2) corners of pieces of lanes
-    lined: NDArray[np.float64]  # (num_strips,) 1: the sides of the strip are lane lines
+    lined: NDArray[np.float64]  # (num_strips,) 1: the sides of the strip are lane lines; else 0
     strip_index: Grid
     walls: NDArray[np.void]  # WALL (num_walls,)
     wall_index: Grid
@@ -50,7 +50,7 @@ def gather_walls(
     """Collect the walls around a vehicle, always in the same order.
 
     `walls`: WALL (num_walls,) in the map frame. `reach_m`: walls farther away are left out.
-    `out`: WALL (num_walls,), overwritten up to the returned number.
+    `out`: WALL (num_walls,) in the vehicle's frame, overwritten up to the returned number.
 
     Returns the number of walls.
     """

@@ -82,7 +82,7 @@ def mend_backward_paths(shapes: list[Shape], ways: Sequence[Way]) -> None:
             last = way.inside[-1]
             shapes[last] = _join(shapes[last], heads[way.after][0])
         if (way.before in tails or way.after in heads) and _is_broken(shapes, way):
-            mended.add(way)  # the part removed from the lanes runs backwards
+            mended.add(way)  # the added part of a lane runs backwards
     for way in ways:
         if way in mended:
             redraw(shapes, way)

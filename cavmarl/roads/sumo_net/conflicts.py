@@ -237,8 +237,8 @@ def stop_back(
         ways: (K,) the paths plus some metres of the lanes at both ends.
 
     Returns:
-        (L,), 0 if no path from another lane comes near. If `MOST_M` is not enough, the map's stop
-        line is kept.
+        (L,), 0 if no path from another lane comes near, or if a line would have to move back more
+        than `MOST_M`.
     """
     back = np.zeros(len(ends))
     at: dict[int, list[int]] = defaultdict(list)
@@ -360,7 +360,8 @@ def fill_conflicts(
 ) -> None:
     """Write the conflicts of each LINK, and its waiting position in the junction, into `links`.
 
-    Also set `merges` of lanes at whose end vehicles may turn into the road without having to stop.
+    Also set `merges` of lanes whose vehicles have the right of way over vehicles that merge with
+    them without a signal, except at all-way stops.
     """
     links["first_conflict"] = first_conflict[:-1]
     links["num_conflicts"] = np.diff(first_conflict)

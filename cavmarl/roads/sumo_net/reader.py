@@ -62,8 +62,8 @@ if TYPE_CHECKING:
     from cavmarl.roads.sumo_net.sumo_xml import ParsedNet
 
 APPROACH_M = 12.0  # up to this far before a junction, bodies may be oblique to waiting vehicles
-FORK_WATCHED_M = 5.0  # up to this far after a junction, drivers turning off watch others' rears
-MAX_CROSSING_M = 2000  # paths are compared point by point, so memory grows with length squared
+FORK_WATCHED_M = 5.0  # rears up to this far after a junction may still cover a path that forks off
+MAX_CROSSING_M = 2000  # maximum length of a path over a junction; memory grows with its square
 MOST_CROSSING = "CAVMARL_MAX_CROSSING_M"  # environment variable that overrides this limit
 _NAMED = 5  # maximum number of changed lanes named in a note
 _ENDINGS = (".gz", ".xml", ".net", ".osm", ".xodr", ".sumocfg", *SCENE_SUFFIXES)

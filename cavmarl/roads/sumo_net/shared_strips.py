@@ -100,7 +100,7 @@ def _strip(
     side = -1.0 if left_hand else 1.0
     middle = side * _left_of(shapes[one.lanes[-1]], shapes[other.lanes[-1]])
     if middle.min(initial=np.inf) >= NEAR_M:
-        return None  # the other lanes are farther away
+        return None  # the innermost lanes do not overlap, and all others are farther apart
     lanes: list[tuple[int, int]] = []
     missing_m = 0.0
     for own, far in product(one.lanes, other.lanes):

@@ -228,7 +228,7 @@ class SignalRows:
         self.phase_detectors += detectors
 
     def find(self, connection: Any, junction_kind: str) -> tuple[int, int]:
-        """Return the SIGNAL row and state letter of a connection, (-1, -1) without a signal.
+        """Return a connection's SIGNAL row and index of its letter; (-1, -1) without a signal.
 
         Raises MapError: the connection's signal has no program, or no letter for it.
         """

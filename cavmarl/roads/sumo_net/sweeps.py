@@ -59,8 +59,8 @@ class Movements(NamedTuple):
     links: NDArray[np.void]  # LINK (K,), with conflicts
     conflicts: NDArray[np.void]  # CONFLICT
     ways: Sequence[LinkPath | None]  # over the junction, with `AHEAD_M` of the lanes at its ends
-    # for each U-turn: lanes beside its target lane that only departing vehicles enter, see
-    # `unfed_beside`
+    # for each U-turn: lanes beside its target lane into which no link leads (vehicles may start
+    # trips there), see `unfed_beside`
     unfed: Mapping[int, Sequence[LinkPath]] = MappingProxyType({})
 
 
@@ -256,7 +256,7 @@ def _find_beside(
     poses: dict[int, list[NDArray[np.float64]]],
     found: list[list[tuple[float, ...]]],
 ) -> None:
-    """Find where a U-turn sweeps over the start of a lane on which vehicles have departed.
+    """Find where a U-turn sweeps over vehicles that have started their trip on an adjacent lane.
 
     The rows have the U-turn's link as link and as foe, as if these vehicles came from that link.
     """

@@ -1,4 +1,4 @@
-"""Counts of the vehicles that cameras at signals see."""
+"""Counts of the vehicles that cameras at S signals see on N watched lanes, in W worlds."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def count_by_cameras(
     rules: SignalRules,
     worlds: SignalWorlds,
     cameras: Cameras,
-    chosen: NDArray[np.bool_],  # (W,)
+    chosen: NDArray[np.bool_],  # (W,) worlds in which a decision is due
     counts: NDArray[np.int64],  # (W, N, COUNTS), overwritten in the chosen worlds
 ) -> None:
     """Count the vehicles on the watched lanes of the chosen worlds that cameras see.

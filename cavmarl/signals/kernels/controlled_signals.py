@@ -1,4 +1,4 @@
-"""Tables of the signals that agents control, for kernels."""
+"""Tables of S signals that agents control, and of N watched lanes before and after them."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """Greens that agents choose: the allowed choices, and the phases between two greens.
 
 The phase is a function of the tick and the last change, so repeated calls in a tick change nothing.
+W is the number of worlds, S of signals, and G the largest number of greens of a signal.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Counts of vehicles on lanes near signals.
+"""Counts of vehicles on the N watched lanes near signals, in W worlds.
 
 All counts are whole numbers, so their sums do not depend on the order or the owners of vehicles.
 """
@@ -99,7 +99,7 @@ def count_lanes(
     near_m: float,  # distance from the end of a lane, for NEAR_LINE
     rows: NDArray[np.void],  # VEHICLE (k, W, C)
     num_owned: NDArray[np.int64],  # (k, W)
-    chosen: NDArray[np.bool_],  # (W,)
+    chosen: NDArray[np.bool_],  # (W,) worlds in which a decision is due
     counts: NDArray[np.int64],  # (W, N, COUNTS), overwritten in the chosen worlds
 ) -> None:
     """Count the vehicles on the watched lanes of the chosen worlds."""

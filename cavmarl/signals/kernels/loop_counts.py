@@ -115,7 +115,7 @@ def estimate_by_loops(
     rules: SignalRules,
     worlds: SignalWorlds,
     loops: Loops,
-    chosen: NDArray[np.bool_],  # (W,)
+    chosen: NDArray[np.bool_],  # (W,) worlds in which a decision is due
     readings: NDArray[np.int64],  # (W, N, 2, READINGS), overwritten in the chosen worlds
     counts: NDArray[np.int64],  # (W, N, COUNTS) of the previous decision; overwritten
 ) -> None:

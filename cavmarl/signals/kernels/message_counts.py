@@ -47,7 +47,7 @@ def count_by_messages(
     worlds: SignalWorlds,
     units: UnitLanes,
     inboxes: NDArray[np.void],  # REPORT (W, receivers, most), see `v2x.kernels.v2x_records`
-    chosen: NDArray[np.bool_],  # (W,)
+    chosen: NDArray[np.bool_],  # (W,) worlds in which a decision is due
     counts: NDArray[np.int64],  # (W, N, COUNTS) of the previous decision, overwritten where chosen
 ) -> None:
     """Count the vehicles in the inboxes of the units, by lane at the reported positions.

@@ -29,7 +29,7 @@ def observe_signals(
     controlled: ControlledSignals,
     durations: SignalTicks,
     ticks: NDArray[np.int64],  # (W,)
-    chosen: NDArray[np.bool_],  # (W,)
+    chosen: NDArray[np.bool_],  # (W,) worlds in which a decision is due
     held: NDArray[np.int64],  # (W, S, HELD)
     counts: NDArray[np.int64],  # (W, N, COUNTS)
     observations: NDArray[np.float32],  # (W, S, D), overwritten in the chosen worlds
@@ -76,7 +76,7 @@ def reward_signals(
     observed: NDArray[np.bool_],  # (W,) worlds in which a decision is due
     ends: bool,  # whether an interval between decisions has ended; else the first interval begins
     counts: NDArray[np.int64],  # (W, N, COUNTS)
-    stood: NDArray[np.int64],  # (W, S) sum of ticks at the last decision, updated
+    stood: NDArray[np.int64],  # (W, S) STOOD_TICKS of `approach` at the last decision, updated
     terms: NDArray[np.float32],  # (W, S, T) overwritten; 0 where no interval ends
     rewards: NDArray[np.float32],  # (W, S) overwritten; 0 where no interval ends
 ) -> None:

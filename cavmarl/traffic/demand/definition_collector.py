@@ -203,7 +203,7 @@ class DefinitionCollector:
 
     def _name(self, kind: str, element: Element) -> None:
         name = element.text("id")
-        # Types share names with type distributions, and routes with route distributions.
+        # An id may name either a type or a type distribution; the same applies to routes.
         for other in (kind, f"{kind}Distribution", kind.removesuffix("Distribution")):
             known = self.named.get(other, {}).get(name)
             if known is not None:
@@ -240,7 +240,7 @@ class DefinitionCollector:
         self._check_room(element, timing)
         chance, period_ms = device(element)
         if _has_no_route(element):
-            chance = 1.0  # as in SUMO, the speeds at its departure determine its route
+            chance = 1.0  # as in SUMO, its route is searched with the speeds at its departure
         row: Iterable[float] = (
             self.report.files.index(element.path),
             element.line,

@@ -306,7 +306,7 @@ def propose(
 
 @kernel
 def accept(departures: DepartureQueue, running: NDArray[np.int64], capacity: int) -> None:
-    """Accept proposals in the order of the queue; the other departures stay queued.
+    """Accept proposals in the order of the queue; a vehicle that would touch another one waits.
 
     `departures`: the accepted proposals remain in `passing`; queue and counts are written.
     `running`: (W,) vehicles of each world in all zones. `capacity`: maximum number of vehicles per

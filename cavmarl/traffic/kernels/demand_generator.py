@@ -1,6 +1,6 @@
 """The seeded demand generator, the departure queue, and the replacement of leaving vehicles.
 
-A departure gets its number and random draws when it is ordered. It waits in the queue, which is
+A departure gets its vehicle id and random draws when it is ordered. It waits in the queue, which is
 sorted by id, until there is a safe gap at its place. No departure is dropped.
 """
 
@@ -76,7 +76,7 @@ def _order(
     agent: int,
     trips: TripTable,
 ) -> None:
-    """Number and draw a departure, and append it to the queue."""
+    """Append a departure with a new id and a random trip to the queue."""
     key = keys[w]
     own_map = map_of(key, roads.maps.shape[0])
     departure = departures.queue[w, _number(demand, departures, ticks[w], key, w)]
@@ -96,7 +96,7 @@ def _order(
 
 @kernel
 def _number(demand: Demand, departures: DepartureQueue, tick: int, key: np.uint64, w: int) -> int:
-    """Append a numbered departure of the generator to the queue; return its place."""
+    """Append a departure with a new id, but without a trip, to the queue; return its place."""
     vehicle = departures.next_id[w]
     departures.next_id[w] = vehicle + 1
     place: int = departures.num_queue[w]
@@ -414,7 +414,7 @@ def settle(
 ) -> None:
     """Count the vehicles that have left, and order departures that replace them.
 
-    Vehicles are handled in the order of their ids, so that their replacements get the same numbers
+    Vehicles are handled in the order of their ids, so that their replacements get the same ids
     wherever the rows were stored.
 
     `demand`: the generator's tables. `departures`: counts, sums and queue are written; `passing`

@@ -77,9 +77,9 @@ def entry_lane(
     among the lanes that its route follows furthest without a lane change); on a tie, the right
     lane.
 
-    `roads`: roads of the world. `ranks`: how crowded each lane of the departure's edge is; read if
-    it chooses by traffic. `taken`: (L,) lanes on which another departure tries to enter in this
-    tick.
+    `roads`: roads of the world. `ranks`: vehicles near the place on each lane of the edge, read if
+    the departure chooses by traffic. `taken`: (L,) lanes on which another departure tries to enter
+    in this tick.
     """
     code = departure["lane_code"]
     if code == LANE_GIVEN:
@@ -198,7 +198,7 @@ def _wanted_speed(
     leader: int,
     scratch: Scratch,
 ) -> float:
-    """Return the speed in m/s at which a departure would enter at `s` of an endless lane.
+    """Return the speed in m/s at which a departure would enter at `s` if the lane had no end.
 
     `leader`: the entry of the leader, or -1.
     """

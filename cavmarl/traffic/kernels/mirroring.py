@@ -55,7 +55,7 @@ def mirror(
     """Update a world's mirrored rows, in all zones, to the state that SUMO reports.
 
     `seen`: SEEN (n,) by ascending number; the field `route` contains paths. `zoned`: the owned rows
-    of `side` are written; vehicles that SUMO has removed are marked as arrived. `side`: 0 or 1.
+    in half `side` of its rows are written; vehicles that SUMO has removed are marked as arrived.
 
     Returns the number of arrived vehicles.
     """
@@ -155,7 +155,7 @@ def send_on(
     A vehicle that is on no edge of its new route keeps the old route.
 
     `numbers`: (n,) VEHICLE["order"] of the vehicles, ascending. `chosen`: (n,) their new paths.
-    `zoned`: the owned rows of `side` are written. `side`: 0 or 1.
+    `zoned`: the owned rows in half `side` of its rows are written.
 
     Returns the number of vehicles on a new route.
     """

@@ -40,9 +40,9 @@ def find_asking(
 ) -> int:
     """List the vehicles that search for a route in this second, by ascending id.
 
-    These are background vehicles of the demand outside junctions and without a stop ahead that are
-    due for a search, have reached an edge with rerouters, or have not reacted to the last change of
-    lanes.
+    These are background vehicles of the demand whose routes may change (`may_leave`), outside
+    junctions and without a stop ahead. They are due for a search, have reached an edge with
+    rerouters, or have not reacted to the last change of lanes.
 
     `has_rules`: (num_edges,) whether an edge has rerouters. `looks`: LOOK, by VEHICLE["order"];
     edges without rerouters are marked as seen. `changed_at`: tick of the last change, or -1.

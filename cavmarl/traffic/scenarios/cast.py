@@ -42,7 +42,7 @@ START_M = 5.0  # m at the start of a lane where no vehicle is placed
 
 
 def take_seats(streets: Streets, scene: Scene, num: int) -> list[Seat]:
-    """Return the seats of `num` agents, starting with the seat of the scene.
+    """Return the seats (starts) of `num` agents, beginning with the seat of the scene.
 
     The other agents follow on the approach of the first, with the same speed and goal. Their lanes
     are outside junctions, and no actor rides along them, because actors do not react to vehicles.

@@ -260,7 +260,7 @@ def clipped_size(track: Track) -> tuple[float, float, float]:
 
 
 def speeds_of(track: Track, step_s: float) -> NDArray[np.float64]:
-    """Return (T,) speeds along the heading since the previous sample, else to the next sample."""
+    """Return (T,) speeds in m/s along the heading, from the previous sample or else to the next."""
     moves = np.diff(track.poses[:, :2], axis=0)
     heading = track.poses[:, 2].tolist()
     speeds = np.zeros(len(track.valid))

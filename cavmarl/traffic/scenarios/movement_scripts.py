@@ -44,7 +44,7 @@ class Shadow(NamedTuple):
     speed: float  # speed of the body along the lane in m/s, at least 0
 
     def joined(self, other: Shadow) -> Shadow:
-        """Return the smallest stretch that contains both stretches."""
+        """Return the smallest stretch that contains both stretches, with speed 0."""
         return Shadow(min(self.start, other.start), max(self.end, other.end), 0.0)
 
 

@@ -196,7 +196,7 @@ def stream(
 def meet_stream(
     streets: Streets, place: Crossing, far_m: float, stream_mps: float, parameters: Any
 ) -> Scene | None:
-    """Stage an agent that meets the first car of a stream at constant speed; None: no room.
+    """Stage a stream of cars so that the first meets an agent at constant speed; None: no room.
 
     `place`: where both paths meet. `far_m`: initial distance from the agent to the junction.
     `parameters`: the scenario's `speed_mps` of the agent, number of `cars`, `gap_s` between the

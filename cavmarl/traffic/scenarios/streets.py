@@ -111,7 +111,7 @@ class Streets:
         return Opposite(other, place, abs(d))
 
     def crossings(self, directions: str, *, yields: bool, merges: bool) -> Iterator[Crossing]:
-        """Yield pairs of car movements that share an area in the middle or at the end of both.
+        """Yield pairs of car movements that share an area; the second movement is straight.
 
         `directions`: SUMO's letters for the first movement, such as `s` or `lL`. `yields`: whether
         the first movement must yield to the second. `merges`: whether both lead into one lane.

@@ -1,4 +1,4 @@
-"""`ToldLog`: the positions of this package's vehicles that SUMO has received, tick by tick.
+"""`ToldLog`: what SUMO has received (see `MOVED`), tick by tick.
 
 Files, seed and this log determine SUMO's state. A SUMO that is restarted and receives the same log
 reaches the same state, so a process that replaces a dead process needs nothing else.
@@ -91,7 +91,7 @@ class ToldLog:
         return self._words[: self._words.item(_SIZE)]
 
     def note(self, moved: NDArray[np.void]) -> None:
-        """Record the positions that SUMO receives for the next tick.
+        """Record what SUMO receives for the next tick.
 
         Args:
             moved: MOVED (n,).
@@ -119,7 +119,7 @@ class ToldLog:
         self._words = np.array(words, dtype=np.int64)
 
     def ticks(self, count: int) -> Iterator[NDArray[np.void]]:
-        """Return the positions that SUMO received in each of the first `count` ticks: MOVED (n,).
+        """Return what SUMO received in each of the first `count` ticks: MOVED (n,).
 
         Args:
             count: number of ticks since the reset.

@@ -42,7 +42,8 @@ class SumoAnswer(NamedTuple):
 
     seen: NDArray[np.void]  # SEEN (n,) by ascending number
     letters: bytes  # letters of all signals, one signal after the other
-    line: dict[str, Any]  # rare events: `departed`, `teleported`, `routes`
+    # `time_ms`, and rare events: `departed`, `teleported`, `dropped`, `routes`, `ways`, `unseen`
+    line: dict[str, Any]
 
 
 def choose_interface(wanted: str) -> str:
@@ -110,7 +111,7 @@ class SumoProcess:
         """Start a step without waiting for its answer.
 
         Args:
-            moved: MOVED (n,), the positions of this package's vehicles after the step.
+            moved: MOVED (n,), what SUMO receives before the step.
 
         Raises:
             SumoError: the process has ended.

@@ -197,7 +197,7 @@ class SumoTraffic:
     def step(self, worlds: Worlds, side: int) -> None:
         """Let SUMO take its step; errors as in `SumoWorlds.step`.
 
-        `worlds`: the worlds of any shard. `side`: side that holds the next rows.
+        `worlds`: the worlds of any shard. `side`: half of `ZoneState.rows` with the next rows.
         """
         ticks = worlds.ticks.tolist()
         self.worlds.step(ticks, lambda w: self._told(w, side, ticks[w]))

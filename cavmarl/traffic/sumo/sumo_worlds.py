@@ -118,7 +118,7 @@ class SumoWorlds:
 
         Args:
             ticks: (W,) since the reset, before the step.
-            moved: returns MOVED (n,) of a world, its vehicles after the step.
+            moved: returns MOVED (n,), what the SUMO of a world receives before the step.
 
         Raises:
             SumoError: a process has ended, so that its world has to be reset; or a world and its

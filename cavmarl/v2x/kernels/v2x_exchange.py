@@ -336,7 +336,7 @@ def exchange_messages(
         units: UNIT (num_units,), the roadside units.
         common: clocks, keys and signals of the worlds.
         zoned: vehicles of all zones.
-        side: side of the zones' rows that holds the committed rows.
+        side: 0 or 1, the half of `ZoneState.rows` with the state at the current tick.
         first: first world.
         last: end of the worlds, exclusive.
         mail: state that outlives the tick; written.

@@ -119,9 +119,9 @@ class Sending(NamedTuple):
     """The sending schedule of stations; periods are in ticks, 0: never."""
 
     dt_s: float
-    equipped: float
+    equipped: float  # share of the background vehicles that can send
     cam_period: int
-    cam_triggered: bool
+    cam_triggered: bool  # whether a due CAM is sent only if ETSI's conditions are met
     denm_period: int
     hard_braking_mps2: float
     stationary_s: float
@@ -140,7 +140,9 @@ class Sending(NamedTuple):
 class Mail(NamedTuple):
     """State that outlives a tick, of W worlds with R receivers: agents, then roadside units.
 
-    Packets in flight are in L + 1 slots; packets of tick t are in slot t modulo L + 1.
+    L is the latency in ticks. Packets of tick t are in slot t modulo L + 1, with room for P packets
+    and Q reports. A receiver has room for N vehicles, E events and G signals; U is the number of
+    roadside units.
     """
 
     objects: NDArray[np.void]  # REPORT (W, R, N) vehicles, nearest first

@@ -50,7 +50,7 @@ def gather(
 ) -> int:
     """List the vehicles of all zones of a world by id, and return their number.
 
-    `side`: side of the zones' rows to read. `stations`: STATION (C,), overwritten. `spare`: scratch
+    `side`: half of `ZoneState.rows` to read. `stations`: STATION (C,), written. `spare`: scratch
     of the same size.
     """
     num = 0

@@ -29,8 +29,10 @@ from cavmarl.driving.kernels.lanes.route_following import (
 )
 
 MAX_LINKS_AHEAD = 2
-STANDS_BEFORE_M = 15.0  # distance from centre to lane end while a vehicle waits to change lanes
-LEAST_M = 1e-9  # least distance beyond the line of a vehicle on the junction; 0: at the line
+# With this distance from centre to lane end, a vehicle that waits for a lane change, or covers the
+# lane next to its own, blocks the first link of the lane.
+STANDS_BEFORE_M = 15.0
+LEAST_M = 1e-9  # least registered distance beyond the line for a vehicle inside the junction
 BLOCK = 64  # number of rows that stay in the cache between both loops
 
 # A vehicle on a link, or before it.
@@ -59,7 +61,7 @@ def register_links(
 ) -> None:
     """List, for each link, the vehicles on it or approaching it in `scratch.approach`.
 
-    Approaching vehicles are listed only for links with conflicts.
+    Approaching vehicles are listed only for links with conflicts or swept areas.
     """
     pairs = 0
     scratch.largest[:] = 0

@@ -54,8 +54,8 @@ from cavmarl.roads.kernels.lanes_now import is_closed
 # their full deceleration suffices.
 COMFORT_STOP = 3.0
 STEERED_MPS = 5.0  # assumed top speed of a steered car in a turn
-SEE_FOES_M = 4.5  # up to this distance, a driver that yields is ready to stop, as in SUMO
-LAST_CHANCE_M = 3.0  # a driver whose front is this close to the line still goes at yellow
+SEE_FOES_M = 4.5  # as in SUMO, a driver that yields stays ready to stop until it is this close
+LAST_CHANCE_M = 3.0  # a driver that has yielded and is this close to the line still goes at yellow
 STUB_LANES = 4  # number of lanes ahead that are searched for a stop sign
 EXIT_LANES = 4  # number of lanes behind a junction that are searched for room
 EXIT_LOOK_M = 75.0  # largest distance of that search: room for ten cars
@@ -83,7 +83,7 @@ def _hold_for_foes(
     phase: NDArray[np.int32],
     scratch: Scratch,
 ) -> int:
-    """Return the reason (HOLD_*) why foes keep row i, `distance` m before its line, from `link`.
+    """Return the reason (HOLD_*) why foes keep row i out of `link`; its line is `distance` m ahead.
 
     If `inside`, the shared areas beyond the waiting position at `wait_m` are checked, else the
     areas before it. For a stopped vehicle, HOLD_EXIT_BLOCKED (a foe stays in the way) has priority
@@ -143,7 +143,7 @@ def _hold_for_foes(
 
 @inlined_kernel
 def _stops_all(signal: int) -> bool:
-    """Return whether this signal stops all vehicles that are still before the previous junction."""
+    """Return whether a signal is red or yellow, so that it stops all vehicles one junction away."""
     red = signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW
     return red or signal == SIGNAL_YELLOW_MINOR or signal == SIGNAL_YELLOW_MAJOR
 

@@ -28,8 +28,8 @@ def time_to_change(
 
     If the state never changes, the result is the length of the cycle. For an actuated program, and
     for a program whose greens are chosen, it is the earliest possible time: each phase counts with
-    its minimum duration, and any green may be chosen next. A state that the caller shows can change
-    at any time.
+    its minimum duration, and any green may be chosen next. If the caller of the environment
+    overrides the state, it can change at any time, so the result is 0.
     """
     if overridden_state(roads, link, phase) != NOT_OVERRIDDEN:
         return 0.0
@@ -68,11 +68,12 @@ def time_to_change(
 def soonest_choice(
     roads: RoadArrays, program: np.void, row: int, index: int, end_s: float, by_green: bool
 ) -> float:
-    """Return the earliest time in s at which the state changes if greens are chosen; inf: never.
+    """Return the earliest time in s at which a link's state changes, if greens are chosen.
 
-    `row`: active PHASE row, which ends in `end_s` s, or can end then if it is a green. `by_green`:
-    whether only changes between green and other letters count. The phases of such a program are its
-    greens and, for each pair of greens, the phases between them; see `signals.agent_programs`.
+    The result is inf if the state never changes. `program`: has its greens and, for each pair of
+    greens, the phases between them; see `signals.agent_programs`. `row`: active PHASE row, which
+    ends in `end_s` s, or can end then if it is a green. `index`: of the link's letter. `by_green`:
+    whether only changes between green letters and all others count.
     """
     now = _shown(roads, row, index, by_green)
     left = end_s

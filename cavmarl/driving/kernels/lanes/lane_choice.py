@@ -50,10 +50,11 @@ SIDEWAYS_S = 2.5  # duration of a lane change, which has to end before the lane 
 BRAKE_TIME_S = 0.5  # braking that ends within this time does not count
 SIDE_GAP_M = 1.0  # smallest gap between bumpers with which a lane change starts
 # To change to the right, a driver waits this far before the end of its lane; to change to the left,
-# it waits a vehicle length earlier. So two vehicles that swap lanes do not block each other.
+# it waits its length and `SWAP_ROOM_M` earlier. So two vehicles that swap lanes do not block each
+# other.
 MERGE_ROOM_M = 2.0
 SWAP_ROOM_M = 3.0
-# Smallest swap room of a background vehicle, if its rear would otherwise be in the junction.
+# Smallest `SWAP_ROOM_M` of a background vehicle, if its rear would otherwise be in the junction.
 LEAST_SWAP_M = SIDE_GAP_M + 0.2
 LINE_SLACK_M = 0.3  # a vehicle may stop this far before the place where it should wait
 MERGE_ROOM_SHARE = 0.25  # largest room for a change to the right, as a share of the lane's length

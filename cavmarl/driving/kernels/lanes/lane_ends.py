@@ -33,7 +33,7 @@ def lane_end(
     merge_room_m: float,
     dt: float,
 ) -> float:
-    """Return the constraint of the end of a lane that the route leaves by a lane change."""
+    """Return the constraint of a lane's end, unless the route continues or ends on this lane."""
     step = travel.steps[way + lane]
     if step["to_go"] < math.inf and step["change"] == 0:
         return no_constraint(kind)

@@ -2,8 +2,9 @@
 
 For each lane, the index lists the vehicles by increasing (s, id). A vehicle whose body also covers
 an adjacent lane is in both lists. A scripted vehicle is in the lists of all lanes that it covers or
-is about to cover. A lost vehicle is in no list. The values that other drivers read are copied to
-the entries, which are contiguous in memory. The index does not depend on the order of rows.
+is about to cover. A vehicle far from all lanes (`is_lost`) is in no list. The values that other
+drivers read are copied to the lists (records ENTRY), which are contiguous in memory. The index does
+not depend on the order of rows.
 """
 
 from __future__ import annotations

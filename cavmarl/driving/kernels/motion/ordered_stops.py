@@ -17,7 +17,10 @@ LANE_EARLY_M = 100.0  # distance before a stop at which the driver changes to th
 
 @inlined_kernel
 def distance_to_stop(roads: RoadArrays, travel: TripTables, row: np.void) -> float:
-    """Return the distance in m from a vehicle's front to its next stop on this edge, or inf."""
+    """Return the distance in m from a vehicle's front to its next stop on this edge, or inf.
+
+    The result is also inf if the vehicle has passed the stop.
+    """
     if row["stop"] < 0 or row["stop"] == row["stops_end"]:
         return np.inf
     stop = travel.stops[row["stop"]]

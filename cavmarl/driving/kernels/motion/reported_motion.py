@@ -1,4 +1,4 @@
-"""Rows whose motion another simulator reports: aims, positions on the lanes, and rates.
+"""Rows whose motion another simulator reports: points to steer to, lane positions, and rates.
 
 A row first moves as cavmarl would move it, and is corrected only if the report differs. So a
 simulator that moves vehicles exactly as cavmarl does changes no bit.
@@ -43,7 +43,7 @@ def find_aims(
     rows: NDArray[np.void],  # VEHICLE (C,)
     aims: NDArray[np.float64],  # (n, 2) x and y, overwritten; NaN for agents
 ) -> None:
-    """Find the point in the middle of its path to which each vehicle should steer."""
+    """Find, for each vehicle, the point ahead on its path's centre line to which it steers."""
     for k in range(places.shape[0]):
         row = rows[places[k]]
         if row["driver"] == DRIVER_AGENT:

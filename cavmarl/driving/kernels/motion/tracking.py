@@ -55,7 +55,7 @@ def side_lane(roads: RoadArrays, row: np.void) -> int:
 def _on(
     roads: RoadArrays, lane: int, x: float, y: float, hint: float
 ) -> tuple[float, float, float]:
-    """Return s, d and the distance outside the lane in m of a point relative to `lane`."""
+    """Return s and d of a point on `lane`, and how far it is outside; `hint`: approximate s, m."""
     row = roads.lanes[lane]
     s, d, _, _ = project_near(
         roads.points, row["first_point"], row["num_points"], x, y, hint, WINDOW_M
@@ -169,7 +169,7 @@ def locate(
     lane, and if the distance beyond the lane's start or end is larger than d, it replaces d.
 
     Returns:
-        EVENT_OFF_ROAD, EVENT_WRONG_WAY or 0.
+        The bits EVENT_OFF_ROAD and EVENT_WRONG_WAY; 0: neither.
     """
     lane = row["lane"]
     s, d, outside = _on(roads, lane, row["x"], row["y"], row["s"])

@@ -27,7 +27,7 @@ class Parameters:
 
 
 def places(streets: Streets, parameters: Parameters) -> dict[str, Crossing]:
-    """Return straight movements that another movement crosses at about a right angle."""
+    """Return straight movements that another straight movement crosses."""
     found: dict[str, Crossing] = {}
     for yields in (False, True):
         for crossing in streets.crossings("s", yields=yields, merges=False):

@@ -32,5 +32,5 @@ def places(streets: Streets, parameters: Parameters) -> dict[str, Meeting]:
 
 
 def stage(streets: Streets, place: Meeting, parameters: Parameters) -> Scene:
-    """Stage the first car to meet an agent that keeps its speed where both paths join."""
+    """Stage cars so that the first meets an agent at constant speed where both paths join."""
     return place[1]

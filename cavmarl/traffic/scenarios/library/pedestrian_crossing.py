@@ -44,7 +44,7 @@ def places(streets: Streets, parameters: Parameters) -> dict[str, int]:
 
 
 def stage(streets: Streets, place: int, parameters: Parameters) -> Scene:
-    """Stage a pedestrian whose start makes a vehicle collide if it keeps its speed."""
+    """Stage a pedestrian so that an agent at constant speed would collide with it."""
     lane, s = place, streets.length_m(place) - BEHIND_M
     near, far = streets.kerbs_m(lane, s)
     side = near + KERB_M

@@ -51,7 +51,7 @@ def places(streets: Streets, parameters: Parameters) -> dict[str, int]:
 
 
 def stage(streets: Streets, place: int, parameters: Parameters) -> Scene:
-    """Stage vans that block the road from the start and leave after the agent has arrived."""
+    """Stage vans that block the road from the start, and leave after the agent has come near."""
     seat = approach(streets, place, FAR_M, parameters.speed_mps)
     closed = int(streets.network.links["to_lane"][place])
     goal = streets.onward(closed)

@@ -50,7 +50,7 @@ def _loses_its_signal(streets: Streets, crossing: Crossing) -> bool:
 
 
 def stage(streets: Streets, place: Meeting, parameters: Parameters) -> Scene:
-    """Stage the first car to meet an agent that keeps its speed, in the junction."""
+    """Stage cars so that the first meets an agent at constant speed in the junction."""
     crossing, scene = place
     signal = int(streets.network.links["signal"][crossing.link])
     outage = Outage(streets.network.signal_ids[signal], parameters.dark_s)
