@@ -1,4 +1,7 @@
-"""One scenario per remedy, a rule that closes a hole of docs/explanation/ownership.md."""
+"""One scenario per remedy, a rule that closes a hole of docs/explanation/ownership.md.
+
+H1 to H28 number the holes of that page, and I1 to I10 its invariants.
+"""
 
 from __future__ import annotations
 
@@ -142,7 +145,7 @@ def abort_fence() -> None:
 
 
 def fence_stays() -> None:
-    """H6: the fence stays after the replica is dropped."""
+    """H6: the fence (newest tick heard of a vehicle) stays after the replica is dropped."""
     bench, prepare = prepared()
     bench.commit()
     (step, _) = bench.begin()
@@ -186,7 +189,7 @@ def log_before_send() -> None:
 
 
 def done_incarnation() -> None:
-    """H12: a DONE of a fenced process is ignored."""
+    """H12: a DONE of a fenced (replaced) process is ignored."""
     explore(ticks=2, false_alarms=1)
 
 
@@ -221,7 +224,7 @@ def tick_never_resets() -> None:
 
 
 def run_fence() -> None:
-    """H15: messages of another run are dropped."""
+    """H15: messages of another run of the program are dropped."""
     bench = Bench()
     step = bench.begin()[0]
     (done,) = bench.give(step)
@@ -279,7 +282,7 @@ def double_buffer() -> None:
 
 
 def segment_per_incarnation() -> None:
-    """H28: each process writes to its own segment."""
+    """H28: each process writes to its own segment of the committed store."""
     store = MemoryStore()
     store.write(0, 2, 7, b"of the living host")
     store.write(0, 1, 7, b"of the zombie")
@@ -309,7 +312,7 @@ BORDERS = Borders(hysteresis_m=2.0, ahead_s=1.0, max_speed_mps=20.0)
 
 
 def near_border(x_m: float, owner: int = 0, speed_mps: float = 0.0) -> list[bool]:
-    """Return, for a vehicle that drives east, one entry per near zone: whether it has crossed."""
+    """Return for each zone near a vehicle whether the vehicle has crossed; it drives east."""
     row = vehicles([(x_m, 0.0, 0.0)], speed=speed_mps)
     zoned = zoned_of([row if zone == owner else row[:0] for zone in (0, 1)])
     out = np.zeros(2, dtype=NEAR)

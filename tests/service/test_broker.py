@@ -95,7 +95,7 @@ def test_the_progress_of_a_job_counts_the_steps_of_all_runs_and_drivers(
 
 def test_a_node_with_an_old_or_missing_load_gets_no_session(fleet: Fleet) -> None:
     fleet.join("a")
-    fleet.now_s += 3.5  # the load is old, but no sweep has run yet
+    fleet.now_s += 3.5  # the load is old, but the broker has not searched for lost nodes yet
     assert reasons(fleet) == {"a": "stale"}
     fleet.register("b")  # b has reported no load yet
     assert reasons(fleet) == {"a": "stale", "b": "stale"}
