@@ -1,4 +1,7 @@
-"""Gap acceptance at junctions: which gaps before and after a foe a driver accepts."""
+"""Gap acceptance at junctions: which gaps a driver accepts before and after a foe.
+
+A foe is a vehicle whose path over the junction conflicts with that of the driver.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Steered cars stay on the road in turns and bends; trips avoid turns that are too tight."""
+"""Steered cars (agents) stay on the road in turns and bends; trips avoid too tight turns."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ def test_nodes_report_the_progress_of_their_jobs(fleet: Fleet) -> None:
         fleet.beat_of("a", jobs={job.id: [30]})
 
 
-def test_a_node_with_a_watcher_receives_the_scores_of_all_nodes(fleet: Fleet) -> None:
+def test_a_node_with_a_session_on_an_open_page_receives_all_scores(fleet: Fleet) -> None:
     fleet.join("a", "b")
     fleet.register("c")
     session = fleet.open()
