@@ -139,7 +139,8 @@ def test_a_foe_that_stops_on_the_junction_blocks_distant_vehicles(
 def test_a_standing_vehicle_starts_half_a_second_before_the_area_is_clear(
     blocks: Blocks, out_s: float, hold: int, waits: bool
 ) -> None:
-    # The vehicle is over one second away from the area. A vehicle that moves does not stop.
+    # The vehicle is over one second away from the area. With HOLD_NONE, it has been given its turn,
+    # so it does not stop.
     own = {"speed": 0.0, "hold": hold, "stopped_at": FROM_SOUTH}
     assert blocks(0.2, "line", -out_s * SPEED_MPS, 2.0, own) == (HOLD_YIELD if waits else HOLD_NONE)
 

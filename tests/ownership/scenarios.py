@@ -234,7 +234,7 @@ def run_fence() -> None:
 
 
 def repeat_limit() -> None:
-    """H22: a tick in which every host dies ends in an error."""
+    """H22: if each new host of a zone dies in the same tick, the tick ends in an error."""
     bench = Bench()
     bench.begin()
     for _ in range(bench.limits.repeats):
