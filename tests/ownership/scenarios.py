@@ -1,6 +1,10 @@
 """One scenario per remedy, a rule that closes a hole of docs/explanation/ownership.md.
 
-H1 to H28 number the holes of that page, and I1 to I10 its invariants.
+H1 to H28 number the holes of that page, and I1 to I10 its invariants. The first lines of the
+docstrings are a table on the page. The fence of a vehicle is the newest (epoch, tick) that a host
+has received about it; a fenced process is one whose messages no longer count. A segment is the part
+of the committed store that one process writes. "Every host" means all hosts that a zone gets in
+turn.
 """
 
 from __future__ import annotations
@@ -145,7 +149,7 @@ def abort_fence() -> None:
 
 
 def fence_stays() -> None:
-    """H6: the fence (newest tick heard of a vehicle) stays after the replica is dropped."""
+    """H6: the fence stays after the replica is dropped."""
     bench, prepare = prepared()
     bench.commit()
     (step, _) = bench.begin()
@@ -189,7 +193,7 @@ def log_before_send() -> None:
 
 
 def done_incarnation() -> None:
-    """H12: a DONE of a fenced (replaced) process is ignored."""
+    """H12: a DONE of a fenced process is ignored."""
     explore(ticks=2, false_alarms=1)
 
 
@@ -224,7 +228,7 @@ def tick_never_resets() -> None:
 
 
 def run_fence() -> None:
-    """H15: messages of another run of the program are dropped."""
+    """H15: messages of another run are dropped."""
     bench = Bench()
     step = bench.begin()[0]
     (done,) = bench.give(step)
@@ -234,7 +238,7 @@ def run_fence() -> None:
 
 
 def repeat_limit() -> None:
-    """H22: if each new host of a zone dies in the same tick, the tick ends in an error."""
+    """H22: a tick in which every host dies ends in an error."""
     bench = Bench()
     bench.begin()
     for _ in range(bench.limits.repeats):
@@ -282,7 +286,7 @@ def double_buffer() -> None:
 
 
 def segment_per_incarnation() -> None:
-    """H28: each process writes to its own segment of the committed store."""
+    """H28: each process writes to its own segment."""
     store = MemoryStore()
     store.write(0, 2, 7, b"of the living host")
     store.write(0, 1, 7, b"of the zombie")
