@@ -12,7 +12,8 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs/explanation/architecture.md").read_text(encoding="utf-8")
 PACKAGE = ROOT / "cavmarl"
 MAX_WORDS = 1_500
-ELSEWHERE = {"cavmarl/data/", "kernels/"}  # in the wheel; in several folders
+# The first folder is only in the wheel; folders with the second name are in several folders.
+ELSEWHERE = {"cavmarl/data/", "kernels/"}
 QUESTIONS = re.findall(r"^\| ([^|]+\?) \| (.+) \|$", PAGE, re.MULTILINE)
 
 

@@ -185,7 +185,9 @@ def test_values_beyond_the_range_can_be_clipped_and_counted() -> None:
 @pytest.mark.parametrize(
     ("kind", "first", "idle"), [("continuous", [0.5, 0.1], [0.0, 0.0]), ("discrete", 3, 1)]
 )
-def test_missing_actions_can_be_held_and_counted(kind: str, first: Any, idle: Any) -> None:
+def test_missing_actions_can_repeat_the_last_ones_and_are_counted(
+    kind: str, first: Any, idle: Any
+) -> None:
     env = make(action__missing_action="hold", action__kind=kind)
     twin = make(action__kind=kind)
     for given in ({"car_1": first}, {}, {"car_0": first}):
@@ -215,7 +217,7 @@ def test_step_and_render_before_reset_are_refused() -> None:
 
 
 def test_a_lenient_world_accepts_and_counts_actions_of_libraries() -> None:
-    """With `lenient`, values are clipped, missing actions held and late actions ignored."""
+    """With `lenient`, values are clipped, missing actions repeated and late actions ignored."""
     env = parallel_env("ring", agents=2, background=0, seed=0, max_cycles=3, lenient=True)
     strict = parallel_env("ring", agents=2, background=0, seed=0, max_cycles=3)
     env.reset()

@@ -107,7 +107,7 @@ def test_worlds_are_not_split_if_a_split_is_hardly_faster() -> None:
     assert plan.imbalance == 1.0
 
 
-def test_a_world_above_the_share_of_a_worker_is_split() -> None:
+def test_a_world_that_costs_more_than_the_mean_load_of_a_worker_is_split() -> None:
     costs = [4.0] * 4 + [1.0] * 8
     plan = make_plan(Problem(row(costs, worlds=3), grid(2, 2), idle_snapshot(2)))
     assert plan.imbalance <= 1.1

@@ -1,4 +1,7 @@
-"""Clock drift of an official CARLA client: Table II of the co-simulation paper."""
+"""Clock drift of an official CARLA client: Table II of the co-simulation paper.
+
+An own tick is a tick that the client requests although another caller is the time master.
+"""
 
 from __future__ import annotations
 

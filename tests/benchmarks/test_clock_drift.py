@@ -1,4 +1,7 @@
-"""Clock drift of followers, as in Table II of the paper in docs/explanation/papers.md."""
+"""Clock drift of followers, as in Table II of the paper in docs/explanation/papers.md.
+
+An own tick is a tick that a follower requests although another caller is the time master.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Clock drift of a node of ROS 2 with real `rclpy`, as in Table II of the co-simulation paper."""
+"""Clock drift of a node of ROS 2 with real `rclpy`, as in Table II of the co-simulation paper.
+
+An own tick is a tick that the bridge requests although another caller is the time master.
+"""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ def test_worlds_with_features_that_cavmarl_treats_differently_are_not_comparable
     assert comparable(rows) == rows[:1]
 
 
-def test_a_metric_is_near_within_a_share_of_the_mean_or_the_range_of_sumos_seeds() -> None:
+def test_a_metric_is_near_if_it_is_within_a_share_of_the_mean_or_the_range_of_sumos_seeds() -> None:
     assert in_spread(a_row(mean_speed_mps=9.0), "mean_speed_mps")
     assert not in_spread(a_row(mean_speed_mps=8.9), "mean_speed_mps")
     assert is_near(a_row(mean_speed_mps=8.9), "mean_speed_mps", 0.15)
@@ -70,7 +70,9 @@ def test_a_metric_is_near_within_a_share_of_the_mean_or_the_range_of_sumos_seeds
 @pytest.mark.parametrize(
     ("delay_s", "near"), [(23.0, True), (25.0, True), (25.1, False), (14.9, False), (None, False)]
 )
-def test_a_delay_is_near_within_a_share_or_some_seconds(delay_s: float | None, near: bool) -> None:
+def test_a_delay_is_near_if_it_differs_by_a_share_or_some_seconds(
+    delay_s: float | None, near: bool
+) -> None:
     assert is_delay_near(a_row(mean_delay_s=delay_s)) == near
 
 

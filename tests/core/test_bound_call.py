@@ -1,4 +1,4 @@
-"""Bound calls and their sequences compute the same as ordinary calls from Python."""
+"""Bound calls (calls of a kernel with fixed arguments) and their sequences equal ordinary calls."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bundles of arrays that a kernel creates in a loop, reads, and passes to other kernels."""
+"""Bundles (named tuples of arrays) that a kernel creates in a loop and passes to other kernels."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ def listed(simulation: Simulation, rows: NDArray[np.void]) -> Scratch:
 
 
 def entries(room: Scratch, link: int) -> list[tuple[int, float, float, float]]:
-    """Return (id, dist, speed, half) of the vehicles that a link lists, sorted by id."""
+    """Return (id, distance to the line, speed, half length) of the vehicles that a link lists."""
     found = room.approach[room.link_start[link] : room.link_end[link]]
     assert (found["link"] == link).all()
     return sorted((int(e["id"]), float(e["dist"]), e["speed"], e["half"]) for e in found)
@@ -54,7 +54,7 @@ def entries(room: Scratch, link: int) -> list[tuple[int, float, float, float]]:
 def test_every_link_lists_the_vehicles_on_the_link_and_before_its_line(
     world: Simulation, stand: bool
 ) -> None:
-    """With `stand`, no vehicle can move; the links must list all of them as well."""
+    """With `stand`, no vehicle can move; the links must also list standing vehicles."""
     travel, roads = world.travel, world.network
     for step in range(0, 12, 2):
         for _ in range(step):

@@ -1,4 +1,7 @@
-"""Gap acceptance at junctions: which gaps before and after a foe a driver accepts."""
+"""Gap acceptance at junctions: which gaps a driver accepts before and after a foe.
+
+A foe is a vehicle whose path over the junction conflicts with that of the driver.
+"""
 
 from __future__ import annotations
 
@@ -136,7 +139,8 @@ def test_a_foe_that_stops_on_the_junction_blocks_distant_vehicles(
 def test_a_standing_vehicle_starts_half_a_second_before_the_area_is_clear(
     blocks: Blocks, out_s: float, hold: int, waits: bool
 ) -> None:
-    # The vehicle is over one second away from the area. A vehicle that moves does not stop.
+    # The vehicle is over one second away from the area. With HOLD_NONE, it has been given its turn,
+    # so it does not stop.
     own = {"speed": 0.0, "hold": hold, "stopped_at": FROM_SOUTH}
     assert blocks(0.2, "line", -out_s * SPEED_MPS, 2.0, own) == (HOLD_YIELD if waits else HOLD_NONE)
 

@@ -48,10 +48,10 @@ def test_opposing_left_turns_on_a_short_road_do_not_block_each_other(
 
 
 class Ahead(NamedTuple):
-    """A vehicle that stands before the first of two signals and will turn left at the second."""
+    """A vehicle before the first of two junctions, which will turn left at the second one."""
 
     network: RoadNetwork
-    left_turns_from: int  # the lane between both signals
+    left_turns_from: int  # the lane between both junctions
     link: int  # the link that the vehicle takes next
     phase: NDArray[np.int32]
 
@@ -90,7 +90,7 @@ def is_blocked(scene: Ahead, *others: tuple[float, float, int], turns: bool = Fa
 
     Args:
         scene: The vehicle and the junctions.
-        others: Cars between the signals as (place, speed, reason to stop).
+        others: Cars between the junctions as (s in m, speed in m/s, reason to stop).
         turns: Whether another car turns left inside the second junction.
     """
     network = scene.network

@@ -132,7 +132,11 @@ def test_a_lane_change_considers_followers_on_every_incoming_lane(
 
 @pytest.mark.parametrize(("gap_m", "safe"), [(1.2, False), (2.0, True)])
 def test_no_lane_change_ends_too_close_to_a_leader_at_low_speed(gap_m: float, safe: bool) -> None:
-    """Krauss's model demands only -3.5 m/s² for any gap, because it brakes for a reaction time."""
+    """Lane changes also limit the braking that stops the car within the gap.
+
+    Krauss's model spreads braking from 3.5 m/s over its reaction time of 1 s, so it never demands
+    more than 3.5 m/s² of braking, however small the gap is.
+    """
     roads, types = network("merge"), generated_types().copy()
     set_model(types, MODEL_KRAUSS)
     types["tau"] = 1.0

@@ -1,4 +1,4 @@
-"""How steered cars approach lane ends, and leaders whose bodies are still over a line."""
+"""How steered cars (agents) approach lane ends, and leaders whose bodies are still over a line."""
 
 from __future__ import annotations
 

@@ -85,7 +85,7 @@ def test_a_yielding_driver_approaches_slowly_enough_to_stop(
 
 
 def test_a_left_turn_is_slow_before_its_waiting_position(tmp_path: Path) -> None:
-    """As in SUMO, the car is slowest 4.5 m before the position. There it sees that no foe comes."""
+    """As in SUMO, the car slows down until 4.5 m before the position, where it sees no foe."""
     path = netgenerate(tmp_path / "net.net.xml", *GRID, "-j", "traffic_light")
     network = read_network(path)
     links = network.links

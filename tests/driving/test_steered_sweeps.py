@@ -1,4 +1,4 @@
-"""Areas that steered cars sweep in bends, and drivers that wait before these areas."""
+"""Areas that steered cars (agents) sweep in bends, and drivers that wait before these areas."""
 
 from __future__ import annotations
 

@@ -117,7 +117,7 @@ class BusAndCar:
         )  # fmt: skip
 
     def _announced(self, asks: int, places: tuple[float, float]) -> Scratch:
-        """Register the vehicle that does not ask; `places` are the fronts in m beyond the lines."""
+        """Register the vehicle that is not `asks`; `places`: fronts in m beyond their lines."""
         room = scratch(self.network, 2)
         other = 1 - asks
         links = (self.link, int(self.sweep["foe"]))
@@ -131,7 +131,7 @@ class BusAndCar:
         return room
 
     def stop(self, asks: int, places: tuple[float, float], room_m: float = -np.inf) -> float:
-        """Return where the front of the vehicle that asks has to stop, or inf."""
+        """Return where the front of the vehicle `asks` (0 or 1) has to stop, or inf."""
         room, roads = self._announced(asks, places), self.network.arrays
         link = (self.link, int(self.sweep["foe"]))[asks]
         return float(

@@ -1,4 +1,4 @@
-"""Steered cars stay on the road in turns and bends; trips avoid turns that are too tight."""
+"""Steered cars (agents) stay on the road in turns and bends; trips avoid too tight turns."""
 
 from __future__ import annotations
 
@@ -72,7 +72,8 @@ def test_only_sharp_turns_are_too_tight_and_no_trip_uses_them(tmp_path: Path) ->
 
 
 def test_a_turn_is_too_tight_if_a_steered_car_leaves_its_road(tmp_path: Path) -> None:
-    # The bend is too tight, although a car that aims as far ahead as on straight links stays on it.
+    # The bend is too tight at the distance that cars in turns aim ahead. A car that aimed as far
+    # ahead as on straight links would stay on the road.
     for kind, text in CORNER.items():
         (tmp_path / f"m.{kind}.xml").write_text(text)
     roads = read_network(netconvert(tmp_path, "m"))

@@ -79,7 +79,10 @@ def test_only_long_vehicles_wait_in_a_u_turn_for_adjacent_vehicles(
 
 
 def test_a_bus_in_a_u_turn_reaches_far_over_the_adjacent_lane(network: RoadNetwork) -> None:
-    """Vehicles up to 5 m behind the junction are registered, so the bus knows them."""
+    """The area ends over 5 m beyond the junction, but within `SWEPT_BEYOND_M`.
+
+    Vehicles whose rear is within that distance are registered, so the bus knows them.
+    """
     links, beyond_m = network.links, []
     for turn in np.flatnonzero(links["direction"] == U_TURN):
         sweeps = sweeps_of(network, turn)

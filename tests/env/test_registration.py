@@ -36,7 +36,7 @@ def test_every_environment_is_registered_under_its_ids(name: str) -> None:
         assert world.agents
 
 
-def test_ids_with_discrete_always_make_environments_with_meta_actions() -> None:
+def test_ids_that_contain_discrete_select_meta_actions_even_with_other_overrides() -> None:
     """Programs such as those of CleanRL take an id only, so the id must select the actions."""
     five = gymnasium.spaces.Discrete(5)
     assert gymnasium.make("cavmarl/ringDiscrete-v5").action_space == five

@@ -122,7 +122,7 @@ SIZES = -2
         (SIZES, 0, -1, "a world has a negative size"),
     ],
 )
-def test_invalid_values_of_the_session_are_refused(
+def test_invalid_values_outside_of_the_simulation_are_refused(
     place: int, at: int, value: float, message: str
 ) -> None:
     vec = make(overrides={"population.insertions": 3})

@@ -27,7 +27,7 @@ def make(
 
 
 def wild(rng: np.random.Generator, vec: CavVectorEnv) -> NDArray[np.float32]:
-    """Return actions (W, A, 2) of full throttle and random steering, which soon end most trips."""
+    """Return (worlds, agents, 2) actions: full throttle, random steering; most trips end soon."""
     actions = rng.uniform(-1.0, 1.0, (vec.num_envs, vec.num_agents, 2)).astype(np.float32)
     actions[..., 0] = 1.0
     return actions

@@ -95,7 +95,7 @@ def test_the_standing_time_of_an_agent_begins_anew_after_an_absence() -> None:
         ("discrete", ACTION_FASTER, ACTION_SLOWER),
     ],
 )
-def test_a_stop_of_ten_seconds_counts_as_blocked_if_the_driver_would_wait_else_as_stood(
+def test_a_stop_of_ten_seconds_counts_as_blocked_if_the_driver_would_wait_and_otherwise_as_stood(
     kind: str, goes: float, waits: float
 ) -> None:
     worlds = Worlds([goes, waits, goes], kind)

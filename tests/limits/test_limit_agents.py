@@ -225,7 +225,7 @@ def test_a_saved_state_continues_with_other_zones() -> None:
         assert first.state_hash(1) == second.state_hash(1)
 
 
-def test_a_controller_chooses_for_units_in_worlds_of_vehicles() -> None:
+def test_a_controller_chooses_limits_if_only_vehicles_are_agents() -> None:
     keys = {"limits.controller": "feedback", "limits.wanted_per_km": 5.0}
     vec = vec_of(1, agents=2, overrides=keys)
     with closing(vec):

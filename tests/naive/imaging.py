@@ -123,7 +123,7 @@ def trace(
 
 
 def fan_rays(axes: Vector, azimuths: Vector, elevations: Vector) -> Vector:
-    """Return the directions (A, E, 3) of a fan of rays in the frame of the vehicle."""
+    """Return the directions (azimuths, elevations, 3) of a fan of rays in the vehicle's frame."""
     return np.array(
         [
             [

@@ -56,7 +56,10 @@ def tallies(
     masks: list[int],
     factors: list[int],
 ) -> list[tuple[int, int, int, int]]:
-    """Return, per zone, the number of vehicles and the sums of owners, due and present ghosts."""
+    """Return per zone: number of vehicles, sum of owner hashes, digests of due and present ghosts.
+
+    Due ghosts are the owned rows of other zones within `halo_m` of the zone.
+    """
 
     def sum_of(rows: list[np.void]) -> int:
         words = [np.frombuffer(row.tobytes(), np.uint64).tolist() for row in rows]

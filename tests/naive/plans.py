@@ -55,7 +55,7 @@ def change_cost(roads: RoadNetwork, lane: int) -> float:
 
 
 def costs(roads: RoadNetwork, goal_edge: int, permission: int) -> NDArray[np.float64]:
-    """Return (L,) travel times in s from the start of each lane to the end of the goal, or inf."""
+    """Return the travel time in s from the start of each lane to the end of the goal, or inf."""
     drive = roads.lanes["length_m"] / roads.lanes["speed_mps"]
     allowed = roads.lanes["permissions"] & permission != 0
     cost = np.full(len(roads.lanes), math.inf)

@@ -1,4 +1,4 @@
-"""Layers of driver networks, compared with slow twins, with torch and with recorded bytes."""
+"""Layers of driver networks, compared with tests/naive (twins), torch and recorded bytes."""
 
 from __future__ import annotations
 

@@ -94,7 +94,7 @@ class Bench:
         )
 
     def pass_on(self, messages: Iterable[Message]) -> None:
-        """Deliver messages, the answers to them, and so on."""
+        """Deliver messages and all answers to them, until no party sends another message."""
         for message in messages:
             self.pass_on(self.give(message))
 

@@ -1,4 +1,11 @@
-"""One scenario per remedy, a rule that closes a hole of docs/explanation/ownership.md."""
+"""One scenario per remedy, a rule that closes a hole of docs/explanation/ownership.md.
+
+H1 to H28 number the holes of that page, and I1 to I10 its invariants. The first lines of the
+docstrings are a table on the page. The fence of a vehicle is the newest (epoch, tick) that a host
+has received about it; a fenced process is one whose messages no longer count. A segment is the part
+of the committed store that one process writes. "Every host" means all hosts that a zone gets in
+turn.
+"""
 
 from __future__ import annotations
 
@@ -309,7 +316,7 @@ BORDERS = Borders(hysteresis_m=2.0, ahead_s=1.0, max_speed_mps=20.0)
 
 
 def near_border(x_m: float, owner: int = 0, speed_mps: float = 0.0) -> list[bool]:
-    """Return, for a vehicle that drives east, one entry per near zone: whether it has crossed."""
+    """Return for each zone near a vehicle whether the vehicle has crossed; it drives east."""
     row = vehicles([(x_m, 0.0, 0.0)], speed=speed_mps)
     zoned = zoned_of([row if zone == owner else row[:0] for zone in (0, 1)])
     out = np.zeros(2, dtype=NEAR)

@@ -140,7 +140,7 @@ class Simulator:
         self._decide(born)
         if self._dies(
             "torn log", COORDINATOR
-        ):  # the log ends inside the record, which no party has used yet
+        ):  # the log ends inside its last record, which no party has used yet
             self.log = self.log[: -len(self.log.splitlines()[-1]) // 2]
             self.trace.entries.pop()
             self._restart()
@@ -250,7 +250,7 @@ class Simulator:
         for zombie in [host for host in self.zombies if host.endpoint.zone == zone]:
             self._react(zombie, message, refused, zombie=True)
             if zombie.endpoint.tick > self.directory.table.tick:
-                self.zombies.remove(zombie)  # the fenced process has sent all its messages
+                self.zombies.remove(zombie)  # the replaced process has sent all its messages
         host = self.hosts.get(zone)
         if host is None:
             return

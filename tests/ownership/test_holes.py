@@ -147,7 +147,7 @@ def test_h17_at_a_corner_of_four_zones_the_owner_is_the_zone_of_the_vehicle() ->
         assert bench.owner(7) == zone
 
 
-def test_h18_a_vehicle_that_waits_may_skip_a_zone() -> None:
+def test_h18_a_vehicle_that_waits_for_its_transfer_may_skip_a_zone() -> None:
     bench = Bench(3, limits=Limits(deferral=2))
     bench.tick(births=[(7, 0)])
     bench.tick(movers=[(7, 1)])

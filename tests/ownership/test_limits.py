@@ -1,4 +1,4 @@
-"""Impossible limits are refused; tallies and sets of ids work."""
+"""Impossible limits are refused; tallies of owned vehicles and sets of used ids are correct."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Leases of several ticks, and vehicles that cross a border before they have a record."""
+"""Leases of several ticks, and vehicles that cross a border before the coordinator knows them."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_a_new_vehicle_beyond_the_border_is_offered_in_a_lease_of_no_ticks() -> 
     row["x"], row["y"] = (
         there["x"],
         there["y"],
-    )  # zone 0 owns the vehicle on record, but it is far beyond the border
+    )  # zone 0 owns the vehicle, whose position is now far beyond the border
 
     hosts.report()
     ((report,),) = wires.reports

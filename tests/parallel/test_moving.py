@@ -57,7 +57,7 @@ def moves_per_round(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 def test_moving_worlds_changes_no_result(
     make: Make, moves_per_round: list[int], number: int, env: str
 ) -> None:
-    """The numbers of zones and workers depend on the index of the environment."""
+    """Each environment is tested with one number of zones and workers, chosen by its index."""
     wanted = {"num_envs": 6, "max_cycles": 8, "zones": (1, 4)[number % 2]}
     whole = drive(make(env, **wanted))
     vec = make(env, workers=(2, 2, 3, 3)[number % 4], overrides=RESTLESS, **wanted)

@@ -224,7 +224,7 @@ def test_the_sender_of_a_bad_frame_is_lost_but_not_the_receiver() -> None:
     links.close()
 
 
-def test_nodes_that_cannot_reach_each_other_are_lost_alternately() -> None:
+def test_of_two_nodes_that_cannot_reach_each_other_one_is_lost_in_each_generation_in_turn() -> None:
     links, far = pair()
     with far:
         found = []
@@ -238,7 +238,7 @@ def test_nodes_that_cannot_reach_each_other_are_lost_alternately() -> None:
 
 
 def test_a_node_that_does_not_return_an_action_of_another_node_is_lost() -> None:
-    """A node waits for an action that another node has received and has not returned."""
+    """A node waits for an action of its agent that went to another node and was not returned."""
     links, far = pair()
     seen = watch(links)
 

@@ -53,7 +53,10 @@ def nodes() -> tuple[Node, Node]:
 
 
 def fill(zoned: ZoneState, drawn: np.random.Generator, ids: NDArray[np.int64]) -> None:
-    """Fill the zones with ghosts of these vehicles in random order; many words stay unchanged."""
+    """Fill the zones with ghosts of these vehicles in random order.
+
+    Most words of a vehicle's row are equal in each call, so the stream need not send them.
+    """
     for zone in THEIRS.tolist():
         for w in range(WORLDS):
             chosen = drawn.permutation(ids)[: drawn.integers(len(ids) + 1)]

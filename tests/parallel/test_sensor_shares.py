@@ -1,4 +1,7 @@
-"""Shares of sensor workers are complete; sharing by cost is never slower than round-robin."""
+"""Shares of sensor workers are complete; sharing by cost is never slower than round-robin.
+
+A unit is a sensor with a range of agents; each worker senses some units.
+"""
 
 from __future__ import annotations
 

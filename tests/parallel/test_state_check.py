@@ -225,7 +225,8 @@ def test_invalid_counts_signals_and_owners_are_refused(make: Make, tmp_path: Pat
     assert controllers.size
     _check_refusal(vec, lambda state: state[place]["phase"].fill(MANY))
     now_ms = int(simulation.ticks()[0] * simulation.config.clock.sim_dt_s * 1e3)
-    # If accepted, such a state would make the next tick run all overdue checks one by one.
+    # If such a state were accepted, the next tick would run all overdue checks of the signal
+    # controllers one by one.
     for name, value in (("next_ms", 0), ("next_ms", 1 << 40), ("since_ms", now_ms + 9_000)):
 
         def mistime(state: State, name: str = name, value: int = value) -> None:
@@ -369,7 +370,7 @@ def test_signal_states_with_invalid_greens_times_or_counts_are_refused(make: Mak
     _check_refusal(vec, with_value(counts, (0, 0, 0), -1))
     for column, least in ((lanes.RED_TICKS, 0), (lanes.PASSED, 0), (lanes.FLOW, -1)):
         _check_refusal(vec, with_value(history, (1, 2, column), least - 1))
-    _check_refusal(vec, with_value(counts + 2, (0, 0, 0, 0), -1))  # state of the loops
+    _check_refusal(vec, with_value(counts + 2, (0, 0, 0, 0), -1))  # state of induction loops
     _check_refusal(vec, with_value(place(outputs.loops), (1, 3, 1, 2), 1 << 41))
     controllers = place(common_of_worlds(_worlds(vec).simulation).controllers)
 

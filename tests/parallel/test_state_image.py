@@ -1,4 +1,7 @@
-"""Arrays that are read from an image equal the written arrays, whatever the image held before."""
+"""Arrays that are read from a state image equal the written arrays, whatever it held before.
+
+An image is a copy of arrays in shared memory, with a checksum; it has no pixels.
+"""
 
 from __future__ import annotations
 

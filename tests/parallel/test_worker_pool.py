@@ -1,4 +1,8 @@
-"""A pool of workers survives killed, stopped and interrupted processes."""
+"""A pool of workers survives killed, stopped and interrupted processes.
+
+The image of a worker is the copy of its state in shared memory. A team is a group of workers that
+run one program together and are replaced together.
+"""
 
 from __future__ import annotations
 

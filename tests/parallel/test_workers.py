@@ -27,7 +27,7 @@ SMALL_FIRST = sorted(entries(), key=lambda env: (env not in ("grid4x4", "merge",
 
 @pytest.mark.parametrize(("number", "env"), list(enumerate(SMALL_FIRST)))
 def test_workers_change_no_result(make: Make, number: int, env: str) -> None:
-    """The number of workers depends on the index of the environment."""
+    """Undivided worlds have 1 to 3 workers, chosen by the index of the environment."""
     wanted = {"num_envs": 5, "max_cycles": 8}
     whole = drive(make(env, **wanted))
     for zones, workers in ((1, 1 + number % 3), (4, 2)):

@@ -281,7 +281,7 @@ def set_field(dtype: np.dtype[Any], name: str, value: float) -> Change:
 
 
 NAMES = ("lane", "link", "vtype", "goal", "stop", "way", "id", "x", "length")
-# Agent 6 and order 0 are valid, because these worlds have more than 6 agents, and departures.
+# Agent 6 and order 0 are valid here: these worlds have more than 6 agents, and have departures.
 FORGED = [
     (name, value) for name, values in ROW.items() for value in values
     if (name, value) not in (("agent", 6), ("order", 0))
@@ -317,7 +317,7 @@ def test_the_sender_of_a_replica_with_a_forged_array_is_lost(
 
         return changed
 
-    for n in (4, -9):  # ticks, contacts
+    for n in (4, -9):  # places of the arrays of ticks and of contacts in the state
         with monkeypatch.context() as patch:
             check(patch, FrameKind.KEEP, forge(n), REFUSED, after=1)
 

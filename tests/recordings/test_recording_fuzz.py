@@ -13,7 +13,7 @@ from tests.support.hostile_recordings import Forger, Use, limited_memory, make_r
 
 MUTATIONS = 150
 MANY_MUTATIONS = int(os.environ.get("CAVMARL_RECORDING_MUTATIONS", "1500"))
-EVERY = 10  # one in this many recordings is drawn, and one is shown on a page
+EVERY = 10  # of this many recordings, one is drawn as pictures, and another is shown on a page
 
 
 @pytest.fixture(scope="module")

@@ -33,7 +33,7 @@ def test_each_zone_has_a_colour_that_is_darker_in_the_halo() -> None:
     middle, halo, other = at(15.0, 13.0), at(15.0, 11.0), at(15.0, 5.5)
     assert len({tuple(middle), tuple(halo), tuple(other)}) == 3
     assert sum(halo) < sum(middle)
-    # Outer zones have no end, so there is no halo at the edge of the picture.
+    # Zones at the edge of the map reach to infinity, so no halo is at the edge of the picture.
     assert at(3.0, 1.0) == at(3.0, 5.0)
     assert sum(at(3.0, 9.0)) < sum(at(3.0, 5.0))
 

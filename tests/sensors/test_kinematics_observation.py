@@ -20,7 +20,7 @@ from tests.support.traffic import network
 def table(
     env: Any, rows: NDArray[np.void], i: int, ranges: dict[str, Any], **config: Any
 ) -> NDArray[np.float32]:
-    """Return the table (V, F) that cavmarl computes for row i."""
+    """Return the table (vehicles, features) that cavmarl computes for row i."""
     settings = SensorsConfig(kinematics=KinematicsConfig(**config))
     sensor = kinematics.settings(settings, 0, network("ring"), highway.destinations(env))
     if ranges and config.get("normalize", True):

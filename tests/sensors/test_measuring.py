@@ -1,4 +1,4 @@
-"""Sensors that measure their own vehicle, compared with their twins in each tick."""
+"""Sensors that measure their own vehicle, compared with slow twins (tests/naive) in each tick."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The sensors `way`, `conflicts` and `history`: twins, known values, divisions and settings."""
+"""The sensors `way`, `conflicts` and `history`: known values, divisions and settings.
+
+The first two are also compared with twins, which are slow implementations in tests/naive.
+"""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ CONFIGS: dict[str, dict[str, Any]] = {
 
 
 def layers(env: Any, rows: NDArray[np.void], i: int, **config: Any) -> NDArray[np.float32]:
-    """Return the grid (F, W, H) that cavmarl computes for row i."""
+    """Return the grid (features, cells along x, cells along y) that cavmarl computes for row i."""
     settings = SensorsConfig(occupancy_grid=OccupancyGridConfig(**config))
     sensor = occupancy_grid_sensor.settings(settings, 0, network("ring"), highway.destinations(env))
     road = highway.roads(env)

@@ -88,7 +88,9 @@ def configure(fleet: Fleet, files: dict[str, str], **given: Any) -> str:
         ("model.safetensors", (2).to_bytes(8, "little") + b"[]", "must be an object"),
     ],
 )
-def test_a_file_of_another_kind_is_refused(name: str, content: bytes, words: str) -> None:
+def test_content_that_does_not_fit_its_kind_or_names_other_files_is_refused(
+    name: str, content: bytes, words: str
+) -> None:
     with pytest.raises(ServiceError, match=words) as refused:
         check_content(name, hashlib.sha256(content).hexdigest(), content)
     assert refused.value.problem == "refused"

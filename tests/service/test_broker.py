@@ -62,7 +62,7 @@ def test_nodes_report_the_progress_of_their_jobs(fleet: Fleet) -> None:
         fleet.beat_of("a", jobs={job.id: [30]})
 
 
-def test_a_node_with_a_watcher_receives_the_scores_of_all_nodes(fleet: Fleet) -> None:
+def test_a_node_with_a_session_on_an_open_page_receives_all_scores(fleet: Fleet) -> None:
     fleet.join("a", "b")
     fleet.register("c")
     session = fleet.open()
@@ -95,7 +95,7 @@ def test_the_progress_of_a_job_counts_the_steps_of_all_runs_and_drivers(
 
 def test_a_node_with_an_old_or_missing_load_gets_no_session(fleet: Fleet) -> None:
     fleet.join("a")
-    fleet.now_s += 3.5  # the load is old, but no sweep has run yet
+    fleet.now_s += 3.5  # the load is old, but the broker has not searched for lost nodes yet
     assert reasons(fleet) == {"a": "stale"}
     fleet.register("b")  # b has reported no load yet
     assert reasons(fleet) == {"a": "stale", "b": "stale"}

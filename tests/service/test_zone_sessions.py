@@ -1,4 +1,7 @@
-"""A session whose zones are on several nodes; the tests kill members and the leader."""
+"""A session whose zones are on several nodes (its members), which the tests kill.
+
+The leader is the session's own node: it steps the world and gives its zones to the members.
+"""
 
 from __future__ import annotations
 

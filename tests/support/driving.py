@@ -65,7 +65,7 @@ def idle(simulation: Simulation) -> Commands:
 
 
 def suggested(simulation: Simulation) -> NDArray[np.float64]:
-    """Return (W, A, 2) throttle in m/s² and steering in rad of the built-in driver."""
+    """Return (worlds, agents, 2): throttle in m/s² and steering in rad of the built-in driver."""
     raw = np.zeros((*simulation.outputs.present.shape, 2))
     simulation.suggest(raw)
     return raw

@@ -93,7 +93,7 @@ def vehicles(env: Any) -> NDArray[np.void]:
 
 
 def destinations(env: Any) -> NDArray[np.float64]:
-    """Return (1, G, 2) destinations of the vehicles."""
+    """Return (1, vehicles, 2): x and y of each vehicle's destination in m."""
     return np.array([[vehicle.destination * (1.0, -1.0) for vehicle in env.road.vehicles]])
 
 

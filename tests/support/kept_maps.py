@@ -1,6 +1,6 @@
 """Networks of real maps, which are cached between runs and built again if the sources change.
 
-Only tests of netconvert and of the reader need to run them each time; other tests use this cache.
+Only tests of netconvert and of the network reader run both each time; other tests use this cache.
 """
 
 from __future__ import annotations

@@ -1,9 +1,11 @@
-"""Tiers of tests: unit, integration, slow, and tests that must run alone.
+"""Tiers of tests: unit, integration, slow, twin, ray, and tests that must run alone.
 
 A test is `integration` if its file imports or calls code that starts processes or reads SUMO, or if
 one of its fixtures makes a map. A test is `slow` if it has this mark or is expensive
-(`cpu_time.py`). All other tests are unit tests. A test is `alone` if it measures time, memory or
-cores, or kills processes, so that no other test may run at the same time.
+(`cpu_time.py`). All other tests are unit tests. A unit test is also `twin` if its file imports
+`tests.naive`, which has slow implementations of kernels. A test is `ray` if it starts a Ray
+cluster. A test is `alone` if it measures time, memory or cores, or kills processes, so that no
+other test may run at the same time.
 """
 
 from __future__ import annotations
@@ -85,8 +87,8 @@ def is_needed(path: Path, root: Path, expression: str, turn: int | None = None) 
     Args:
         path: path of the file.
         root: folder of the repository.
-        expression: argument of `-m`, such as `twin and not slow`. Files are
-            excluded only if it begins with `alone`, `ray` or `twin`, or with `slow` in a turn.
+        expression: argument of `-m`, such as `twin and not slow`. Files are excluded only if the
+            expression begins with `alone`, `ray` or `twin`, or, in a turn, with `slow`.
         turn: turn of `make rotation`, in which only slow tests run.
     """
     if path.suffix != ".py" or not path.name.startswith("test_"):

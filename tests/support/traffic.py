@@ -33,7 +33,7 @@ def network(name: str) -> RoadNetwork:
 
 @cache
 def plans(name: str) -> NDArray[np.void]:
-    """Return PLAN (4, L): plans to four goals, which are edges spread over the network."""
+    """Return PLAN (4, lanes): plans to four goals, which are edges spread over the network."""
     roads = network(name)
     outside = np.flatnonzero(~roads.edges["internal"])
     picks = np.linspace(0, len(outside) - 1, 4).astype(int)

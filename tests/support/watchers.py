@@ -20,7 +20,7 @@ def blank_looks(shape: int | tuple[int, ...]) -> NDArray[np.void]:
 
 
 def looks_of(halo: Halo, zone: int) -> NDArray[np.void]:
-    """Return LOOK (L,), the parts of lanes that a zone watches."""
+    """Return LOOK (lanes,), the parts of lanes that a zone watches."""
     looks = blank_looks(len(halo.watcher_start) - 1)
     for lane, look in enumerate(looks):
         watchers = halo.watchers[halo.watcher_start[lane] : halo.watcher_start[lane + 1]]

@@ -90,7 +90,7 @@ def test_vehicles_that_start_in_one_zone_cause_imbalance(vehicles: int, seed: in
     assert imbalance(anywhere) < SHARE * ZONES
 
 
-def test_in_low_density_vehicles_rarely_cross_borders() -> None:
+def test_in_low_density_vehicles_cross_some_border_only_one_at_a_time() -> None:
     simulation = world(LOW)
     at_once: Counter[tuple[int, int]] = Counter()
     for _ in first_minute(simulation):
@@ -110,7 +110,7 @@ def test_medium_density_has_twice_as_many_vehicle_updates_as_low_density() -> No
 
 
 def test_high_density_has_many_vehicles_at_borders_at_once() -> None:
-    # A transfer is announced four seconds before it.
+    # A vehicle is offered to the next zone 100 ticks (5 s) before it would be there.
     simulation = world(HIGH, zones=9, approach_ticks=APPROACH_TICKS)
     in_flight = []
     for _ in first_minute(simulation):

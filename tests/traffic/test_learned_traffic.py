@@ -108,7 +108,7 @@ def test_a_network_drives_a_background_vehicle_as_it_drives_an_agent(
     assert moved_m > 50.0
 
 
-def test_departing_vehicles_have_the_given_shares_of_drivers() -> None:
+def test_vehicles_that_enter_have_the_given_shares_of_drivers() -> None:
     world = simulation("town", MIXED, background=400)
     types = tick_of(world).traffic.travel.types[owned(world)["vtype"]]
     counts = np.bincount(types["network"], minlength=3)

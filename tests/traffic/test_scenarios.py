@@ -127,7 +127,7 @@ def test_a_run_has_the_recorded_hash(name: str, occluded: bool) -> None:
     assert played(name, "idm", params=params).state_hash == GOLDEN[name, occluded]
 
 
-def test_a_blockage_delays_as_long_as_it_lasts() -> None:
+def test_a_longer_blockage_causes_a_longer_delay() -> None:
     short, long = (
         played("intersection_blockage", "idm", params={"blocked_s": blocked_s})
         for blocked_s in (6.0, 40.0)
@@ -135,7 +135,7 @@ def test_a_blockage_delays_as_long_as_it_lasts() -> None:
     assert long.delay_s > short.delay_s + 20.0
 
 
-def test_a_closure_delays_as_long_as_it_lasts() -> None:
+def test_a_longer_closure_causes_a_longer_delay() -> None:
     short, long = (
         played("road_closure", "idm", params={"closed_s": closed_s}) for closed_s in (8.0, 60.0)
     )
@@ -249,7 +249,7 @@ def test_a_scene_limits_the_number_of_agents() -> None:
         make_vec("grid4x4", overrides={"scenario.place": "left1A1_0"})
 
 
-def test_the_driver_that_never_yields_steers() -> None:
+def test_the_driver_that_never_yields_refuses_discrete_actions() -> None:
     discrete = {"action.kind": "discrete"}
     with made("pedestrian_crossing", overrides=discrete) as vec, pytest.raises(PolicyError):
         load_policy("never_yield", vec)

@@ -25,7 +25,7 @@ MODE = {"traffic.source": "sumo-demand", "sensors.signal.timing": False}
 
 
 def stands(simulation: Simulation, seconds: int) -> dict[str, list[tuple[float, float, float]]]:
-    """Drive, and return (x of the centre in m, start in s, length in s) of each vehicle's stops."""
+    """Drive; return (x of the centre in m, start in s, duration in s) of each vehicle's stops."""
     assert simulation.sumo is not None
     dt, tracks = simulation.config.clock.ctrl_dt_s, {}
     for step in range(round(seconds / dt)):

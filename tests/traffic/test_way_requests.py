@@ -26,7 +26,7 @@ from cavmarl.traffic.rerouting import LOOK
 from tests.naive import plans as naive
 from tests.support.traffic import NAMES, network, on_lane, travel_by
 
-ROOM = 400  # most steps of a route
+ROOM = 400  # largest number of steps of a route
 
 
 def outside(roads: RoadNetwork) -> list[int]:
@@ -55,7 +55,7 @@ def way_to(
 
 
 def on_edge(roads: RoadNetwork, lane: int) -> int:
-    """Return the value of `way` for steps that are stored from index 0 on, for a lane's edge."""
+    """Return the field `way` of a vehicle on a lane's edge if its steps start at index 0."""
     return -int(roads.edges[roads.lanes[lane]["edge"]]["first_lane"])
 
 

@@ -20,7 +20,7 @@ KNOWN, GO, LINE, CHANGE, RETURN = 0, 1, 4, 5, 6
 
 
 def signal_data(env: str | Path, steps: int, **settings: Any) -> NDArray[np.float64]:
-    """Return what agents know of their next signal in each step, (steps, A, 9).
+    """Return what agents know of their next signal in each step, (steps, agents, 9).
 
     Columns 0 to 6 are from messages, in m and s. Columns 7 and 8 are the true distance to the line
     in m, and the true time to the change of its letter in s.

@@ -48,7 +48,7 @@ def test_crossed_and_approaching_vehicles_are_found(
             id=100 * zone + np.arange(len(xy)),
         )
         parts.append(rows)
-    reach_m = MAX_SPEED_MPS * ahead_s  # longest distance in `ahead_s`
+    reach_m = MAX_SPEED_MPS * ahead_s  # longest distance that a vehicle drives in `ahead_s`
     borders = Borders(hysteresis_m, ahead_s, MAX_SPEED_MPS)
     zoned = exchanged(partition, reach_m, parts, borders=borders)
     if check_all:
@@ -70,7 +70,7 @@ def test_crossed_and_approaching_vehicles_are_found(
         row = parts[entry["source"]][entry["row"]]
         assert entry["vehicle"] == row["id"]
         depth_m = naive.distance(partition.reaching[entry["source"]], row["x"], row["y"])
-        if depth_m * depth_m == 0.0:  # too small for the kernel's square
+        if depth_m * depth_m == 0.0:  # the kernel squares the depth, and the square underflows
             target = partition.reaching[entry["target"]]
             depth_m = -naive.distance(target, row["x"], row["y"])
         assert entry["depth_m"] == pytest.approx(depth_m)

@@ -11,7 +11,7 @@ from tests.support.divided_scenes import TICK_S, DividedScene
 from tests.support.junction_scenes import build_crossing, with_shorter_lane
 from tests.support.netgenerate import netconvert
 
-CRAWLS = 1e-3  # speed factor at which a vehicle counts as standing
+CRAWLS = 1e-3  # speed factor of a vehicle that must stay where it is
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +98,7 @@ def test_a_bus_leaves_room_for_a_queued_bus_beyond_a_border(
 
 @pytest.mark.parametrize("corner_m", [(6.0, -22.0), (-9.0, -9.0), (0.0, 0.0)])
 @pytest.mark.parametrize("is_far", [False, True])
-def test_a_car_departs_after_a_bus_has_turned_across_its_position(
+def test_a_car_enters_the_world_only_after_a_bus_has_turned_across_its_position(
     priority: Path, tmp_path: Path, corner_m: tuple[float, float], is_far: bool
 ) -> None:
     car = """<vehicle id="late" type="car" depart="0.2" departPos="-0.2" departSpeed="0">

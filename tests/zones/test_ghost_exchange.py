@@ -1,4 +1,7 @@
-"""Exchange of ghosts between shards, and removal of vehicles that leave."""
+"""Exchange of ghosts between the zones of a world, and removal of vehicles that leave.
+
+The twin of the exchange is a slow, plain version in `tests/naive`.
+"""
 
 from __future__ import annotations
 
@@ -166,7 +169,7 @@ def test_gather_equals_exchange_for_several_batches_of_ghosts() -> None:
 
 
 def note_outer(zoned: ZoneState, halo: Halo, parts: list[NDArray[np.void]]) -> None:
-    """List the rows that other zones may see in `outer`, as `advance` does."""
+    """Fill `outer`, the list of rows that other zones may see, as `advance` does."""
     for zone, rows in enumerate(parts):
         left, low, right, high = halo.inner[zone]
         x, y = rows["x"], rows["y"]
@@ -286,7 +289,7 @@ def test_a_leaving_vehicle_is_removed_from_the_list_of_outer_rows(
     assert worlds.outer[0, : len(places)].tolist() == expected[: len(places)].tolist()
 
 
-def test_agents_leave_after_a_whole_step_at_the_end_of_their_trip() -> None:
+def test_agents_leave_when_their_trip_ends_but_not_in_the_step_in_which_they_entered() -> None:
     rows = cars(5)
     rows["driver"] = codes.DRIVER_AGENT
     rows["tick"] = 10

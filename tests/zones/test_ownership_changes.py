@@ -42,7 +42,7 @@ def call(zoned: ZoneState, book: BorderRecords, check_all: bool = False, newborn
 
 
 def next_tick(zoned: ZoneState, book: BorderRecords) -> None:
-    """Search for vehicles near borders in the next tick; the test has moved the rows."""
+    """Begin the next tick and search for vehicles near borders; the test has moved the rows."""
     book.ms[0] += 1.0
     owned = zoned.num_owned[0, 0]
     zoned.num_border[:, 0] = [owned, 0, 0, 0]
@@ -60,7 +60,7 @@ def coming(book: BorderRecords) -> list[tuple[int, int]]:
     return [(int(entry["vehicle"]), int(entry["target"])) for entry in entries]
 
 
-def test_crossed_vehicles_change_owners_by_rising_ids() -> None:
+def test_vehicles_that_have_crossed_a_border_change_owners_in_the_order_of_their_ids() -> None:
     zoned, book = world((13.0, 5.0, 0.0), (5.0, 13.0, 0.0), (14.0, 5.0, 0.0), ids=[30, 20, 10])
     assert book.num_crossed[0] == 3
     assert call(zoned, book) == 3
@@ -132,7 +132,7 @@ def test_a_repeated_search_in_one_tick_counts_each_vehicle_once() -> None:
     assert (book.acknowledged[0], book.aborted[0]) == (2 + 1, 1)
 
 
-def test_a_departed_vehicle_keeps_its_owner_for_one_tick() -> None:
+def test_a_vehicle_that_has_just_entered_keeps_its_owner_for_one_tick() -> None:
     zoned, book = world((13.0, 5.0, 0.0), (14.0, 5.0, 0.0), ids=[3, 4])
     book.newborn[0, 0] = 3
     assert call(zoned, book, check_all=True, newborn=1) == 1

@@ -17,8 +17,8 @@ from cavmarl.verify.equivalence import verify_zones
 from tests.support.borders import bounds_around, cut_at
 
 FAST = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.2, "population.mode": "respawn"}
-BRIDGE_M = 4.0  # smallest height between the two roads of a bridge
-NEAR_M = 5.0  # largest horizontal distance between points of the two roads
+BRIDGE_M = 4.0  # smallest height of a bridge above the road below
+NEAR_M = 5.0  # largest horizontal distance between points of these two roads
 Place = NDArray[np.float64]
 
 

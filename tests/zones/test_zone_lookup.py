@@ -99,7 +99,7 @@ def test_ghosts_reach_across_narrow_zones_and_corners() -> None:
 
 
 @given(st.data(), partitions(), st.sampled_from([0.0, 3.0, 25.0]), st.sampled_from([0, 2]))
-def test_a_zone_has_ghosts_of_all_vehicles_within_reach_of_its_own(
+def test_a_zone_has_ghosts_of_all_vehicles_within_reach_of_its_own_vehicles(
     data: st.DataObject, partition: ZonePartition, reach_m: float, deferred: int
 ) -> None:
     halo_m = needed_overlap_m(reach_m, 2.0, Limits(deferral=deferred), 50.0, 0.1) + 1e-6

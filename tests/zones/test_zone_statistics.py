@@ -27,7 +27,8 @@ def halves(x: float) -> ZonePartition:
 
 
 def test_lane_lengths_are_counted_in_the_zones_that_they_cross(cross: RoadNetwork) -> None:
-    # Two lanes from -100 to -5, one lane from 5 to 100, two lanes at 0.
+    # Each lane is 95 m long. In x, two lanes reach from -100 to -5, one lane from 5 to 100, and two
+    # lanes run along x = 0.
     assert zone_statistics(halves(-50.0), cross).lane_km == pytest.approx((0.1, 0.375))
     assert zone_statistics(halves(50.0), cross).lane_km == pytest.approx((0.425, 0.05))
 
@@ -63,7 +64,7 @@ def test_counted_vehicles_and_ghosts_equal_the_twin(cross: RoadNetwork) -> None:
 
 
 def test_zones_narrower_than_the_halo_are_listed(cross: RoadNetwork) -> None:
-    # Outer zones have no end, so only the middle zone can be too narrow.
+    # Zones at the edge of the map reach to infinity, so only the middle zone can be too narrow.
     assert zone_statistics(PINWHEEL, cross, halo_m=10.0).narrow == ()
     assert zone_statistics(PINWHEEL, cross, halo_m=10.1).narrow == (4,)
 

@@ -102,7 +102,7 @@ def test_distributions_are_drawn_with_their_weights(demand: Reader) -> None:
     np.testing.assert_allclose(share["route"], [0.2, 0.8], atol=0.02)
 
 
-def test_a_draw_near_one_picks_an_option_of_its_own_list() -> None:
+def test_the_largest_random_number_below_1_picks_an_option_of_its_own_list() -> None:
     choices = Choices([Options((k,), (1.0,)) for k in range(5000)])
     most = np.nextafter(1.0, 0.0)
     picked = choices.pick(np.arange(5000, dtype=np.int32), np.full(5000, most))

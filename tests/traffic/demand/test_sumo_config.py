@@ -98,7 +98,7 @@ def test_a_scale_changes_the_hash_and_the_number_of_departures(read: Read) -> No
         read('<scale value="-1"/>')
 
 
-def test_types_get_the_model_and_the_deviation_of_the_configuration(read: Read) -> None:
+def test_types_get_the_model_and_the_speed_deviation_of_the_configuration(read: Read) -> None:
     types = (
         '<vType id="own" carFollowModel="Krauss" speedDev="0.3"/>'
         '<vType id="drawn" speedFactor="normc(1,0.2,0.5,1.5)"/><vType id="plain"/>'
