@@ -202,7 +202,7 @@ class Zone:
             car.sensors[name] = MountedActor(actor)
 
     def sense(self, sensor: str, vehicles: Sequence[int]) -> dict[int, str]:
-        """Return the last tick's frame of each vehicle in base64, if the vehicle has a frame."""
+        """Return the last tick's frames of a sensor, by vehicle, in base64; some may be missing."""
         found = {}
         for vehicle in vehicles:
             data = self._cars[vehicle].sensors[sensor].data(self._frame, self._timeout_s)

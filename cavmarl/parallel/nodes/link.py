@@ -97,7 +97,7 @@ class NodeFrame(NamedTuple):
 
 
 _KINDS = {int(kind): kind for kind in FrameKind}
-URGENT = frozenset(
+URGENT = frozenset(  # handled on arrival, before earlier frames of other kinds
     {
         FrameKind.MESSAGES,
         FrameKind.KEEP,

@@ -20,7 +20,7 @@ from cavmarl.parallel.worlds.step_arrays import StepArrays
 from cavmarl.zones.kernels.agent_frames import UNOWNED, pack_actions, take_actions
 
 Agents = NDArray[np.int64]
-"""Agents, numbered through all worlds."""
+"""Agents, numbered through all worlds: `w * A + agent`."""
 
 ZoneRects = list[list[float]]
 """Zones as a JSON value, see `node_cuts.zones_as_json`."""

@@ -88,7 +88,7 @@ class NodePool:
         self,
         world: World,
         runs: Sequence[WorldRun],  # (W,)
-        zones: Zones,  # initial zones of each node
+        zones: Zones,  # initial zones of each node, its home zones
         supply: NodeSupply,
         *,
         answer: Callable[[memoryview], bytes],  # answers an EXCHANGE by a network simulator
