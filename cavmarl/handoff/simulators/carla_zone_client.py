@@ -303,7 +303,7 @@ class Zone:
     def _drive(self, car: Car, now: CarState, wanted: CarState, aim: Sequence[float] | None) -> Any:
         """Return the control by which a vehicle reaches its wanted speed, and steers.
 
-        The vehicle steers to its aim by pure pursuit (Coulter 1992); an agent steers as commanded.
+        A vehicle steers to its aim by pure pursuit (Coulter 1992), an agent to the wanted heading.
         """
         accel = (wanted.speed - now.speed) / self._dt
         if aim is None:

@@ -69,7 +69,7 @@ class NodeCommand(NamedTuple):
     receptions: list[bytes] | None = None  # answers of a network simulator so far in this step
 
     def of_node(self, number: int, owner: NDArray[np.int32], lease: bytes) -> list[Bytes]:
-        """Return the pieces of the frame for a node. Arguments are as in `Actions.of_node`.
+        """Return the pieces of the frame for a node, see `Actions.of_node`; `lease`: STEP messages.
 
         The actions start at a whole word of 8 bytes, since kernels read them.
         """

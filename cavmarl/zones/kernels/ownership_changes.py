@@ -82,7 +82,7 @@ class BorderRecords(NamedTuple):
     num_coming: NDArray[np.int64]  # (W, 2) number of entries of both lists
     known: NDArray[np.int64]  # (W,) entries of the current list that were in the previous list
     acknowledged: NDArray[np.int64]  # (W,) sum of the entries of `coming` in all earlier ticks
-    aborted: NDArray[np.int64]  # (W,) number of vehicles that have turned away or left
+    aborted: NDArray[np.int64]  # (W,) number of vehicles that have turned back or left the world
     tick: NDArray[np.int64]  # (W,) tick of the rows in which `near` was found
     ms: NDArray[np.float64]  # (W,) clock time at the start of that tick, ms
     newborn: NDArray[np.int64]  # (W, C) ids that have entered since the last tick began
