@@ -30,7 +30,7 @@ def assign(problem: Problem) -> tuple[Placement, str]:
     and the time of the moves. An excluded worker keeps its shards until balancing moves them.
 
     Raises:
-        NoAdmissibleWorkerError: there are shards to be placed and all workers are excluded.
+        NoAdmissibleWorkerError: shards need a place, and all (in a row: any) workers are excluded.
     """
     workers, rejections = workers_of(problem)
     if problem.present is None:

@@ -116,7 +116,7 @@ def note_own(
     chosen: Flags,  # (W,) worlds to update
     number: int,  # number of this process
     own: Flags,  # (W, A) output: `present`, in the worlds to update
-    mine: Flags,  # (W · A,) output: these agents in the chosen worlds
+    mine: Flags,  # (W · A,) output: agents of `own` in the chosen worlds
     owner: Owners,  # (W · A,) output: `number`, or `UNOWNED`
 ) -> None:
     """Record which agents this process owns, according to its own knowledge."""

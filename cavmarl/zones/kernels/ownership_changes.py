@@ -77,7 +77,7 @@ class BorderRecords(NamedTuple):
     num_near: NDArray[np.int64]  # (W,) number of entries of `near`
     num_crossed: NDArray[np.int64]  # (W,) number of vehicles in `near` that have crossed
     owned: NDArray[np.int64]  # (W,) number of vehicles when `near` was made
-    coming: NDArray[np.void]  # COMING (W, 2, 2 C) near and not crossed; two alternating lists
+    coming: NDArray[np.void]  # COMING (W, 2, 2 C) near, not handed over; two alternating lists
     turn: NDArray[np.int64]  # (W,) index of the current list; the other is the previous tick's
     num_coming: NDArray[np.int64]  # (W, 2) number of entries of both lists
     known: NDArray[np.int64]  # (W,) entries of the current list that were in the previous list
