@@ -25,12 +25,12 @@ def assign(problem: Problem) -> tuple[Placement, str]:
     """Place all shards, or move some of them; return the placement and a short description.
 
     Shards without an answering worker go to the worker that finishes them first. Of the other
-    shards, at most `max_moves` move, and only if the slowest worker exceeds a perfect division by
-    more than the tolerance. The gain must exceed both the tolerance's share of a tick and the time
-    that the moves take. An excluded worker keeps its shards until balancing moves them.
+    shards, at most `max_moves` move, and only if the slowest worker exceeds a perfect division
+    (`fair_s`) by more than the tolerance. The gain must exceed both the tolerance's share of a tick
+    and the time of the moves. An excluded worker keeps its shards until balancing moves them.
 
     Raises:
-        NoAdmissibleWorkerError: there are shards to be placed and all workers are excluded.
+        NoAdmissibleWorkerError: shards need a place, and all (in a row: any) workers are excluded.
     """
     workers, rejections = workers_of(problem)
     if problem.present is None:
@@ -48,7 +48,7 @@ def assign(problem: Problem) -> tuple[Placement, str]:
 
 
 def _place(problem: Problem, workers: Workers) -> tuple[Placement, str]:
-    """Return the placement with the fewest separated neighbours that is about as fast as any."""
+    """Of placements about as fast as `longest`, return the one with fewest separated neighbours."""
     shards = range(len(problem.shards))
     nowhere = Placement(problem, workers, [-1 for _ in shards])
     if problem.in_row:

@@ -123,7 +123,7 @@ def make_plan(problem: Problem) -> Plan:
     """Place the shards; equal problems give equal plans on every machine.
 
     Raises:
-        NoAdmissibleWorkerError: there are shards to be placed and all workers are excluded.
+        NoAdmissibleWorkerError: shards need a place, and all (in a row: any) workers are excluded.
     """
     placement, method = assign(problem)
     numbers = placement.workers.numbers

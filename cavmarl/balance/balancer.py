@@ -19,7 +19,7 @@ class Balancer:
         plan: the current plan; reproducible from its own problem.
 
     Raises:
-        NoAdmissibleWorkerError: all workers are excluded.
+        NoAdmissibleWorkerError: all workers are excluded (in a row: any).
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class Balancer:
         """Make the next plan: place lost shards, and move a few other shards if that saves time.
 
         Raises:
-            NoAdmissibleWorkerError: a worker is lost, and all other workers are excluded.
+            NoAdmissibleWorkerError: a worker is lost, and all (in a row: any) others are excluded.
             ConfigError: there are more workers than shards, or a cost is invalid.
         """
         before = self.plan

@@ -111,7 +111,7 @@ def divide(
 
 def halo_m(
     config: EnvConfig,  # its `zones.halo_m` is used if it is set
-    reach_m: float,  # the longest distance at which a driver considers anything
+    reach_m: float,  # the longest distance at which a driver, sensor or term considers anything
     zones: int,  # number of zones
     fastest_mps: float = MAX_SPEED_MPS,  # longest move in a tick (with jumps) / length of a tick
     late_ticks: int = 0,  # see `divide`

@@ -14,7 +14,7 @@ from cavmarl.ownership.transitions import State
 
 
 class CommittedStates(Protocol):
-    """The part of the committed store that decisions read."""
+    """The states of all vehicles at the committed tick, as far as decisions read them."""
 
     def state(self, vehicle: int) -> bytes:
         """Return the vehicle's complete state at the committed tick."""
@@ -78,11 +78,11 @@ class Decisions:
         """Decide about movers: pairs of a vehicle and the zone that contains it.
 
         Returns:
-            The switches, the deferrals, and the ids of switches between zones that are not
-            neighbours.
+            The switches, the deferrals, and the ids of vehicles that switch between zones that are
+            not neighbours.
 
         Raises:
-            ProtocolError: a vehicle or a zone does not exist, or the zone is not a neighbour.
+            ProtocolError: a vehicle or a zone does not exist, or `Neighbours` forbids a switch.
         """
         switches, deferred, teleports = [], [], []
         for vehicle, zone in sorted(movers):

@@ -106,7 +106,7 @@ class Directory:
         limits: Limits | None = None,
         neighbours: Neighbours | None = None,
     ) -> Directory:
-        """Restore the coordinator that wrote these records. Send `resend` before all else."""
+        """Restore the coordinator that wrote these records. Send the messages of `resend` first."""
         if not records or not isinstance(records[0], Reset):
             raise JournalError("a log must begin with a RESET, which has the id of the run")
         directory = cls(records[0].run, zones, store, limits, neighbours)

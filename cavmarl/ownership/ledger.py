@@ -21,7 +21,7 @@ _WORD = _OWNED - 1
 DIGEST_BYTES = 16
 
 
-# One transfer needs the digest of a state in five places.
+# Cached, because one transfer needs the digest of a state in five places.
 @lru_cache(maxsize=256)
 def state_digest(state: bytes) -> bytes:
     """Return the digest, 16 bytes, of one vehicle's state."""
@@ -67,8 +67,8 @@ class OwnedTally(NamedTuple):
 def member(run: bytes, vehicle: int, epoch: int) -> int:
     """Return the keyed hash of an owned vehicle, in [0, 2**64).
 
-    This is SplitMix64's finalizer (Steele, Lea, Flood 2014). It is fast, because it runs several
-    times per tick. It detects sets that differ by mistake, but does not withstand attacks.
+    This is SplitMix64's finalizer (Steele, Lea, Flood 2014). It has to be fast: it runs
+    several times per tick. It detects sets that differ by mistake, but does not withstand attacks.
     """
     word = int.from_bytes(run[:8], "little") + vehicle * 0x9E3779B97F4A7C15
     word = (word + epoch * 0xC2B2AE3D27D4EB4F) & _WORD

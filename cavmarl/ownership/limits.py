@@ -11,14 +11,14 @@ from cavmarl.core.errors import ConfigError
 class Limits:
     """Deadlines that all parties of a run share."""
 
-    # Ticks for which the source keeps a crossed vehicle without an acknowledgement (D). Afterwards,
-    # the vehicle is handed over with its state attached.
+    # Ticks for which the source keeps a vehicle that has crossed the border, if the target has not
+    # acknowledged its state (D). Afterwards, the vehicle is handed over with its state attached.
     deferral: int = 2
     lifetime: int = 16  # ticks after which a replica that is not refreshed is dropped (K)
     attempts: int = 3  # number of times that a PREPARE is sent in one tick (A)
     repeats: int = 3  # limit of new hosts for one tick of one zone (R_max)
-    backoff: int = 4  # ticks without an offer to a target that refused
-    capacity: int = 100_000  # number of replicas that one host keeps
+    backoff: int = 4  # ticks after a refusal without an offer of that vehicle to that target
+    capacity: int = 100_000  # limit of the replicas that one host keeps
     schema: int = 1  # version of the vehicles' states
 
     def __post_init__(self) -> None:

@@ -1,7 +1,8 @@
 """The source's side of an approach: its offers to other zones.
 
 For each vehicle and target, a tick has at most one PREPARE or ABORT. An unanswered PREPARE is sent
-at most A times in its tick. After a refusal, the target receives no offer for some ticks.
+at most `Limits.attempts` times in its tick. After a refusal, the target receives no offer of the
+vehicle for `Limits.backoff` ticks.
 """
 
 from __future__ import annotations
@@ -86,7 +87,7 @@ class Offers:
                 del self.unanswered[vehicle, ack.zone]
 
     def refused(self, nack: Nack) -> None:
-        """Stop offers to a target for some ticks, unless the state was damaged in transit."""
+        """Stop offers of refused vehicles to a target for some ticks; repeat damaged offers."""
         for vehicle, _, reason in nack.entries:
             if reason is not Refusal.DIGEST and (vehicle, nack.zone) in self.unanswered:
                 del self.unanswered[vehicle, nack.zone]

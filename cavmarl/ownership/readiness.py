@@ -1,4 +1,4 @@
-"""The acknowledgements of targets: the coordinator's volatile set "ready"."""
+"""The acknowledgements of targets at the coordinator, which are not in its log."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 A fence is the newest (epoch, tick) of a vehicle in any PREPARE or ABORT so far. Messages that are
 not newer than the fence are ignored, so the order of arrival does not matter. Messages older than
-the lifetime are ignored as well, so that older fences can be forgotten.
+`Limits.lifetime` are ignored as well, so that older fences can be forgotten.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Replicas:
         return True
 
     def refuse(self, offer: Offer, tick: int, reason: Refusal) -> Refusal:
-        """Raise the fence for a state without storing it."""
+        """Set the fence to a state, without storing the state. Return `reason`."""
         self._raise_fence(offer.vehicle, offer.epoch, tick)
         return reason
 
@@ -76,13 +76,13 @@ class Replicas:
         return held is not None and held[:3] == (epoch, tick, digest)
 
     def take(self, vehicle: int) -> bytes:
-        """Remove and return the state that becomes a row, or b"". The fence stays."""
+        """Remove a replica, and return its state; b"" if there is none. The fence stays."""
         after(Party.REPLICA, self.state(vehicle), Event.IN)
         held = self.held.pop(vehicle, None)
         return b"" if held is None else held.state
 
     def expire(self, now: int) -> None:
-        """Drop replicas that have not been refreshed for the lifetime, with their fences."""
+        """Drop replicas that were not refreshed for `Limits.lifetime` ticks, with their fences."""
         last = now - self._limits.lifetime
         if not self._fenced_at or min(self._fenced_at) > last:
             return

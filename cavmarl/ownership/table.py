@@ -121,8 +121,8 @@ class Table:
             zone, epoch = owners.pop(vehicle)
             counts[zone] -= 1
             moves.append((vehicle, zone, epoch, False))
-        # If there are more moves than vehicles, `tallies` counts all vehicles and ignores the
-        # moves. One surplus move is kept as a mark, since new vehicles also add moves.
+        # With more moves than vehicles, `tallies` ignores the moves and counts all vehicles. One
+        # surplus move is kept to show this. It stays in surplus: a new vehicle also adds a move.
         del moves[len(owners) + 1 :]
         self.tick = tick
 

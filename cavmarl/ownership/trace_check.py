@@ -63,7 +63,7 @@ class KnownOwners(Protocol):
     def tallies(self) -> Mapping[Any, Any]: ...
 
 
-"""(zone, incarnation, vehicle, epoch, digest) of a state at a host."""
+"""`Holding`: (zone, incarnation, vehicle, epoch, digest) of a state at a host."""
 
 Owner = tuple[int, int]
 """(zone, epoch) of a vehicle."""

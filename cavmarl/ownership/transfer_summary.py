@@ -46,7 +46,7 @@ class TransferSummary:
     waited_ticks: Spread  # the part of `latency_ticks` after the crossing
     latency_ms: Spread  # same duration as `latency_ticks`, in ms of real time
     state_bytes: Spread  # size of a vehicle's state
-    # distance outside of the owner's zone at the first state; negative: inside
+    # distance outside of the owner's zone when the target got the first state; negative: inside
     prepare_depth_m: Spread
     switch_depth_m: Spread  # distance outside of the owner's zone at the switch
     release_depth_m: Spread  # distance outside of the old zone at the commit of the switch

@@ -152,7 +152,7 @@ class TransferLog:
         return None if self._clock is None else self._clock()
 
     def add_later(self, number: int, removed: int, make: Callable[[], Iterable[Transfer]]) -> None:
-        """Add changes of owner without messages. Their rows are made when they are read."""
+        """Add changes of owner that needed no messages; `make` is called when rows are read."""
         self._counts["switched"] += number
         if removed:
             self._counts["removed"] += removed

@@ -44,7 +44,7 @@ class TeamExecutor(Executor, Protocol):
 
 
 class PhaseExecutor(ABC):
-    """An executor with one method for all phases: `run` runs, measures or records a phase."""
+    """Base class of executors that treat all phases alike, for example to measure their time."""
 
     @abstractmethod
     def run(self, phase: Phase, arguments: tuple[Any, ...]) -> None:

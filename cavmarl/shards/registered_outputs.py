@@ -24,7 +24,7 @@ class RegisteredOutputs:
     def __init__(self, config: EnvConfig, network: RoadNetwork) -> None:
         self._network = network
         self._may_change = config.map.changed_lanes > 0
-        self._networks: dict[int, RoadNetwork] = {}  # by world, if its lanes may change
+        self._networks: dict[int, RoadNetwork] = {}  # world → its roads, if lanes may change
         self._stack = config.sensors.stack
         self._step_s = config.clock.sim_dt_s * config.clock.ticks_per_step
         places = layout(config.sensors)

@@ -89,7 +89,7 @@ class RowCheck:
 
     Attributes:
         indices: ranges of the fields by which kernels index tables, except `way`.
-        steps: limit of the sum of `way` and the lane, which is the index of a row.
+        steps: number of route steps; the sum of `way` and the lane is the index of a step.
     """
 
     def __init__(self, roads: RoadArrays, traffic: NativeTraffic, num_agents: int) -> None:
@@ -144,7 +144,7 @@ class RowCheck:
     def wrong(
         self,
         rows: NDArray[np.void],  # VEHICLE (n,)
-        tail: NDArray[np.void] | None = None,  # PLAN (n,) replaces the last steps; None: no change
+        tail: NDArray[np.void] | None = None,  # PLAN (n,) the last n route steps; None: unchanged
         num_orders: int = MOST,  # number of orders in the world's demand
     ) -> str:
         """Return what is wrong with one of these vehicles of one world; empty if nothing."""
@@ -207,7 +207,7 @@ class RowCheck:
         return _of(rows[np.argmax(wrong)], "order", "is invalid, or its id or tick is invalid")
 
     def _wrong_ways(self, rows: NDArray[np.void], tail: NDArray[np.void] | None) -> str:
-        """Check that a route begins with a step of its lane; follow routes if lanes may differ."""
+        """Check that routes are valid. Follow a route if its first step may be of another lane."""
         lane, way = self._own_lanes(rows["lane"]), rows["way"]
         at = way + lane
         if wrong := self._wrong_places(rows, lane, way):

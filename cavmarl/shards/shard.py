@@ -68,8 +68,8 @@ class Commands:
     # (W, I, 3) INSERT_* code, LANE and position in m of inserted vehicles; (0, 0, 3): insertions
     # are not configured
     inserted: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0, 3)))
-    # (W, E, K) EXTERNAL, new commands to vehicles that the caller poses or drives; (0, 0, K): such
-    # vehicles are not configured
+    # (W, E, K) new commands, the K fields of EXTERNAL, to vehicles that the caller places or
+    # drives; (0, 0, K): such vehicles are not configured
     external: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0, EXTERNAL_FIELDS)))
     # (W, N, 2) LINK row and 1 + SIGNAL_* code of each link whose signal the caller overrides, 0: an
     # unused place; (0, 0, 2): overrides are not configured
@@ -97,7 +97,7 @@ class Shard:
         config: EnvConfig,
         network: RoadNetwork,
         *,
-        plans: NDArray[np.void],  # PLAN (V, G, L), the routes of agents, see `Worlds.lanes` for V
+        plans: NDArray[np.void],  # PLAN (V, goals, lanes), routes of agents; V as in `Worlds.lanes`
         travel: TripTables,
         zoned: ZoneState,  # the rows of all zones
         outputs: Outputs,  # outputs of the agents of all shards, by agent index
@@ -171,7 +171,7 @@ class Shard:
         self.discrete = config.action.kind == "discrete"
 
     def cut(self, zones: ZoneArrays, halo: Halo) -> None:
-        """Set the zones. The caller must then make new groups of this shard."""
+        """Set the zones. The caller must then make new `ShardGroup`s with this shard."""
         self.zones = zones
         self.halo = halo
         seen = self._extent_m
@@ -268,7 +268,7 @@ def _read_only(array: NDArray[np.void]) -> NDArray[np.void]:
 
 
 def override_columns(config: EnvConfig, network: RoadNetwork) -> int:
-    """Return the number of columns of `Worlds.signal_phase` after the columns of the signals."""
+    """Return how many columns `Worlds.signal_phase` has for overrides, after those of signals."""
     return len(network.links) if config.signals.overrides else 0
 
 

@@ -56,7 +56,7 @@ class ShardGroup:
         self.move(commands)
 
     def turn(self) -> None:
-        """Put the next rows into the other buffer, in a tick that sorts rows by lane."""
+        """In a tick that sorts rows by lane, choose the other buffer for the next rows."""
         if self.first.worlds.ticks[0] % TICKS_IN_ORDER == 0:
             self.set_sides(self.first.side, 1 - self.first.side)
 
@@ -142,7 +142,7 @@ class ShardGroup:
         self.departure_calls(departures).retire()
 
     def forget(self, departures: DepartureQueue) -> None:
-        """Drop the ghosts of vehicles that have been retired."""
+        """Drop the ghosts of vehicles that `retire` has removed."""
         self.departure_calls(departures).forget()
 
 

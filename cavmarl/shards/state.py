@@ -29,7 +29,7 @@ S, D = Use.SAVED, Use.DIGESTED
 class StateArray(NamedTuple):
     """An array of the state and its uses."""
 
-    bundle: type[tuple[Any, ...]]
+    bundle: type[tuple[Any, ...]]  # the class that has the array
     name: str
     uses: tuple[Use, ...]
     place: int = 0  # position in the digest
@@ -62,11 +62,11 @@ STATE = (
 
 @cache
 def names_of(bundle: type[tuple[Any, ...]], use: Use) -> tuple[str, ...]:
-    """Return the fields of a bundle with a use, in the order of the table or the digest."""
+    """Return the names of a bundle's arrays with a use; DIGESTED: in the order of `place`."""
     kept = (entry for entry in STATE if entry.bundle is bundle and use in entry.uses)
     return tuple(entry.name for entry in sorted(kept, key=lambda entry: entry.place * (use is D)))
 
 
 def arrays_of(source: Any, bundle: type[tuple[Any, ...]], use: Use) -> Iterator[NDArray[Any]]:
-    """Return a source's arrays of a bundle with a use. For `SharedState`, pass any shard."""
+    """Return the arrays that `names_of` names. `source`: a bundle; for `SharedState`, `Worlds`."""
     return (getattr(source, name) for name in names_of(bundle, use))

@@ -31,7 +31,7 @@ class CoordinatorSetup(NamedTuple):
     """The coordinators of a divided environment."""
 
     coordination: WorldCoordinators  # coordinators of all worlds
-    transfers: tuple[TransferLog, ...]  # one log per world
+    transfers: tuple[TransferLog, ...]  # log of transfers of each world
 
 
 class WorldRun(NamedTuple):

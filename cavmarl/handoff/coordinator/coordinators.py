@@ -58,7 +58,7 @@ class OwnershipRuntime:
         """End the tick, after all zones of this process have computed it."""
 
     def in_flight(self, w: int) -> list[TransferInFlight]:
-        """Return the vehicles whose state has already arrived at their next zone."""
+        """Return the incomplete transfers of a world: vehicles that are offered to another zone."""
         return []
 
 

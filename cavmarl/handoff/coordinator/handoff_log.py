@@ -155,7 +155,7 @@ class HandoffLog:
         return taken
 
     def take_counts(self) -> tuple[int, int]:
-        """Return and clear two sums over ticks: vehicles near borders, and vehicles turned away."""
+        """Return and clear two sums over ticks: near vehicles, and vehicles that turned back."""
         acknowledged, aborted = self._book.acknowledged, self._book.aborted
         counts = acknowledged.item(self._world), aborted.item(self._world)
         acknowledged[self._world] = aborted[self._world] = 0

@@ -63,7 +63,7 @@ FINDING = np.dtype(
         ("kind", np.int64),
         ("vehicle", np.int64),
         ("entered", np.int64),  # number of vehicles that were not in the world at the last check
-        ("left", np.int64),  # number of vehicles that are not in the world at this check
+        ("left", np.int64),  # number of vehicles that have left the world since the last check
     ],
     align=True,
 )
@@ -94,7 +94,7 @@ class Strays(NamedTuple):
     places: NDArray[np.int64]  # (n,) indices in the table of missing vehicles
     rows: NDArray[np.int64]  # (n, 2) zone and row of vehicles that are new in their row
     entered: NDArray[np.int64]  # (n,) ids that were not in the world at the last check
-    left: NDArray[np.int64]  # (n,) ids that are not in the world at this check
+    left: NDArray[np.int64]  # (n,) ids that have left the world since the last check
 
 
 def make_kept(zones: int, capacity: int) -> Kept:

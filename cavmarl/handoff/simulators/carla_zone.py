@@ -121,13 +121,13 @@ class CarlaZone:
         self._call("drop", vehicles=list(vehicles))
 
     def show(self, ghosts: NDArray[np.void], signals: Sequence[str]) -> None:
-        # The OpenDRIVE export names the signal of each movement `SIGNAL_INDEX`.
+        # The OpenDRIVE export names the signal of a movement by signal id and index: `ID_INDEX`.
         letters = {
             f"{name}_{index}": letter
             for name, state in zip(self._signals, signals, strict=True)
             for index, letter in enumerate(state)
         }
-        # Drivers see farther than CARLA needs to show.
+        # Only ghosts near the zone are shown: drivers see farther than CARLA needs to show.
         min_x, min_y, max_x, max_y = self._setup.rect
         x, y = ghosts["x"], ghosts["y"]
         dx = np.maximum(np.maximum(min_x - x, x - max_x), 0.0)

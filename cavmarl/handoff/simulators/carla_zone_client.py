@@ -202,7 +202,7 @@ class Zone:
             car.sensors[name] = MountedActor(actor)
 
     def sense(self, sensor: str, vehicles: Sequence[int]) -> dict[int, str]:
-        """Return the last tick's frame of each vehicle in base64, if the vehicle has a frame."""
+        """Return the last tick's frames of a sensor, by vehicle, in base64; some may be missing."""
         found = {}
         for vehicle in vehicles:
             data = self._cars[vehicle].sensors[sensor].data(self._frame, self._timeout_s)
@@ -303,7 +303,7 @@ class Zone:
     def _drive(self, car: Car, now: CarState, wanted: CarState, aim: Sequence[float] | None) -> Any:
         """Return the control by which a vehicle reaches its wanted speed, and steers.
 
-        The vehicle steers to its aim by pure pursuit (Coulter 1992); an agent steers as commanded.
+        A vehicle steers to its aim by pure pursuit (Coulter 1992), an agent to the wanted heading.
         """
         accel = (wanted.speed - now.speed) / self._dt
         if aim is None:

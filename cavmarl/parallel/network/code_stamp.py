@@ -11,7 +11,7 @@ import numpy as np
 
 @cache
 def code_stamp() -> str:
-    """Return the digest of all sources and the versions of numeric libraries, as text."""
+    """Return the digest of all sources and the version of NumPy, as text."""
     package = Path(__file__).resolve().parents[2]
     digest = hashlib.sha256()
     for source in sorted(package.rglob("*.py")):

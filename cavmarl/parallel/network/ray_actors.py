@@ -89,7 +89,7 @@ class RayActors:
         self._ray.kill(self._actors[number], no_restart=False)
 
     def trouble(self) -> str | None:
-        """Return the error of an actor whose call has ended; None: no call has ended."""
+        """Return the error of an actor whose call has failed; None: no call has failed."""
         ended, _ = self._ray.wait(self._calls, num_returns=len(self._calls), timeout=0)
         for call in ended:
             try:

@@ -153,7 +153,7 @@ class ResultStream:
         data: memoryview,
         chosen: Flags,  # (W,) worlds that were reset or stepped
         of_step: bool,
-        with_common: bool,  # the node is the reporter, and is read first
+        with_common: bool,  # the node sends the common results, and is read first
         number: int,  # number of the node
         owner: NDArray[np.int32],  # (W · A,) output: node of each agent
     ) -> None:

@@ -1,7 +1,8 @@
 """Length of the leases of nodes: at most one step, since a step's commands are known in advance.
 
 A vehicle that crosses a border during a lease stays with its owner until the next lease. Only a
-vehicle with a record can be offered. A lease of 0 ticks first gives new vehicles their records.
+vehicle that is on record at the coordinator can be offered. If a new vehicle has crossed a border,
+a lease of 0 ticks first puts it on record.
 """
 
 from __future__ import annotations

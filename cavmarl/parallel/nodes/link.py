@@ -53,7 +53,7 @@ class FrameKind(IntEnum):
     MESSAGES = 6  # N → N, N → C: other messages of the protocol
     RESULT = 7  # N → C: the result of a task
     FAILED = 8  # N → C: an error
-    SHARE = 9  # N → N: a part of a tick
+    SHARE = 9  # N → N: data of a part of a tick, see `NodePeers`
     KEEP = 10  # N → N, N → C: a replica of the state of a node
     RECOVER = 11  # C → N: nodes are lost or new; start, or go back to a kept state
     SYNC = 12  # N → N: all earlier frames are void
@@ -97,7 +97,7 @@ class NodeFrame(NamedTuple):
 
 
 _KINDS = {int(kind): kind for kind in FrameKind}
-URGENT = frozenset(
+URGENT = frozenset(  # handled on arrival, before earlier frames of other kinds
     {
         FrameKind.MESSAGES,
         FrameKind.KEEP,

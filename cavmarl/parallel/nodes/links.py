@@ -68,7 +68,7 @@ class Links:
         self._looks = system.looks
         self._links: dict[int, Link] = {}
         self._poll = system.poll()
-        self._by_place: dict[int, tuple[int, Link]] = {}  # number of the poll → number and link
+        self._by_place: dict[int, tuple[int, Link]] = {}  # `fileno` → number and link
         self._urgent_frames: deque[tuple[int, NodeFrame]] = (
             deque()
         )  # urgent frames, and their senders

@@ -20,7 +20,7 @@ from cavmarl.parallel.worlds.step_arrays import StepArrays
 from cavmarl.zones.kernels.agent_frames import UNOWNED, pack_actions, take_actions
 
 Agents = NDArray[np.int64]
-"""Agents, numbered through all worlds."""
+"""Agents, numbered through all worlds: `w * A + agent`."""
 
 ZoneRects = list[list[float]]
 """Zones as a JSON value, see `node_cuts.zones_as_json`."""
@@ -69,7 +69,7 @@ class NodeCommand(NamedTuple):
     receptions: list[bytes] | None = None  # answers of a network simulator so far in this step
 
     def of_node(self, number: int, owner: NDArray[np.int32], lease: bytes) -> list[Bytes]:
-        """Return the pieces of the frame for a node. Arguments are as in `Actions.of_node`.
+        """Return the pieces of the frame for a node, see `Actions.of_node`; `lease`: STEP messages.
 
         The actions start at a whole word of 8 bytes, since kernels read them.
         """

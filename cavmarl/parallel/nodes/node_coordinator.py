@@ -402,7 +402,7 @@ class NodeCoordinator:
         ]
 
     def lease(self, messages: Mapping[int, bytes], ticks: int) -> None:
-        """Send the leases that `begin` returned; `ticks`: their length, 0 or more."""
+        """Send leases that `begin` returned; `ticks`: 0 for leases of 0 ticks, else 1 or more."""
         for node, data in messages.items():
             self._links.send(node, FrameKind.LEASE, ticks, [data])
 

@@ -13,7 +13,7 @@ from cavmarl.shards.shard_group import ShardGroup
 
 
 class NodeExecutor(ShardGroup):
-    """Runs phases on the shards of this node; the other shards use the same side of the rows."""
+    """Runs phases on the shards of this node; other shards use the same buffers (sides) of rows."""
 
     def __init__(self, own: Sequence[Shard], foreign: Sequence[Shard]) -> None:
         super().__init__(own)

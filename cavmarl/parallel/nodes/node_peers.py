@@ -40,7 +40,7 @@ PIECES = ("terms", "terminated", "present", "acted", "events", "vehicle_ids", "p
 
 
 class NodePeers(Peers):
-    """Exchanges shares: for each share, this node and every other node swap one frame.
+    """Exchanges shares, the data of parts of a tick: for each, every two nodes swap one frame.
 
     Attributes:
         own: (W, A) agents for which this node sensed last.

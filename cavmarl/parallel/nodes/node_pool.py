@@ -88,7 +88,7 @@ class NodePool:
         self,
         world: World,
         runs: Sequence[WorldRun],  # (W,)
-        zones: Zones,  # initial zones of each node
+        zones: Zones,  # initial zones of each node, its home zones
         supply: NodeSupply,
         *,
         answer: Callable[[memoryview], bytes],  # answers an EXCHANGE by a network simulator
@@ -102,9 +102,9 @@ class NodePool:
         self.zones = self._homes = zones
         self.generation = 0
         self._next_state = 1
-        self._lost: list[int] = []
+        self._lost: list[int] = []  # lost nodes that no other node has replaced yet
         self._failed: set[int] = set()  # nodes that have ended with an error of their own
-        self._is_torn = False
+        self._is_torn = False  # whether nodes have to go back to the newest state first
         self._successions = 0  # losses of the only node in the current command
         self._max_retries = config.workers.max_retries
         self.losses = self.recoveries = self.replacements = self.redirected = 0

@@ -276,7 +276,7 @@ class NodeProgram:
     def _report_missed(self, lost: LinkLostError) -> None:
         """Tell the coordinator that a node cannot be reached, or has sent a bad frame.
 
-        If a frame of the coordinator seems wrong, the state of this node is wrong.
+        If a frame of the coordinator seems bad, this node is at fault, so it reports itself.
         """
         is_coordinator = lost.peer == COORDINATOR
         if is_coordinator and (not lost.fault or self._number < 0):
@@ -535,7 +535,7 @@ def run_node(
     """Run a node until the caller dismisses it or disconnects.
 
     Returns:
-        True if the caller has dismissed the node, False if the caller has disconnected.
+        True if the caller has dismissed the node; False if it has disconnected, or after an error.
 
     Raises:
         OSError: no process listens at the place.

@@ -178,7 +178,7 @@ class NodeWatch:
             generation: number of changes of nodes.
         """
         links = self._links
-        if not self._missed:  # the node has sent a bad frame
+        if not self._missed:  # no reports: the caller itself has noticed the loss
             return lost
         until_s = links.now_s() + MISSED_S
         while lost.peer in links.numbers and (left_s := until_s - links.now_s()) > 0:

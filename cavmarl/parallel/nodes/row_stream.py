@@ -119,7 +119,7 @@ class RowStream:
         """Return the next frame for the other node, valid until the next call.
 
         Args:
-            side: side of the rows whose ghosts are sent.
+            side: buffer of the rows, 0 or 1, whose ghosts are sent.
             passing: vehicles that leave through the departure queue.
         """
         sent = self._sent

@@ -111,7 +111,7 @@ class ZoneEndpoints(OwnershipRuntime):
         # world, vehicle → node that has offered it last
         self._sources: dict[tuple[int, int], int] = {}
         self._division, self._checks = division, checks
-        self._answered, self._num_answered = answered, 0  # `_num_answered` before the current lease
+        self._answered, self._num_answered = answered, 0  # entries before the current lease
         answered.clear()
         self._zones = frozenset(zones)
         self._node_of = node_of
@@ -128,9 +128,9 @@ class ZoneEndpoints(OwnershipRuntime):
         # messages for an episode that starts with the next lease, and their senders
         self._early: list[tuple[int, int, Message]] = []
         self._began = [False] * num_worlds
-        self._stirred = [True] * num_worlds
+        self._stirred = [True] * num_worlds  # whether to search all rows for crossings
         self._is_quiet = [False] * num_worlds  # whether the lease has no STEP for the world
-        self._is_open = False
+        self._is_open = False  # whether a lease has begun and was not reported yet
 
     # Called by a tick
 

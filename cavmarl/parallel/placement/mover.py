@@ -16,7 +16,7 @@ from cavmarl.parallel.placement.step_placement import StepPlacement
 from cavmarl.parallel.placement.work_shares import Part, parts_of
 from cavmarl.parallel.worlds.tasks import Task
 
-_OUTBOX_BYTES = 1 << 12  # initial size of an outbox
+_OUTBOX_BYTES = 1 << 12  # initial size of an outbox, where a worker puts worlds that leave it
 
 Run = Callable[[Task, Any, bool], None]
 

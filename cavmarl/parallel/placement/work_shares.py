@@ -48,7 +48,7 @@ def make_plans(
     snapshot: LoadSnapshot | None = None,  # how busy workers are; None: all are idle
     rule: BalanceRule | None = None,
 ) -> list[Plan]:  # one plan of all worlds, or one plan of the zones of each world
-    """Distribute worlds evenly over workers; divide the worlds if there are more workers.
+    """Distribute worlds evenly over workers; divide worlds if there are more workers than worlds.
 
     Raises:
         ConfigError: there are more workers than zones of all worlds.

@@ -34,7 +34,8 @@ from cavmarl.parallel.processes import process_barrier as barrier
 from cavmarl.parallel.processes.process_barrier import NUMBER, WAKE, WORDS, WakeSignal, present_core
 from cavmarl.parallel.state.state_image import Arrays, Image
 
-# Words of the pool's line, after the words of `process_barrier`.
+# Words of the pool's line, after the words of `process_barrier`: task, whether it has a payload,
+# image to write (-1: none), committed image (-1: none), whether to resume from that image.
 TASK, PAYLOAD, SLOT, COMMITTED, LOADS = 2, 3, 4, 5, 6
 # Words of the line of a worker: how its command ended, and the core on which it began.
 ANSWER, CORE = 2, 3

@@ -90,6 +90,6 @@ class SensorJob(Job):
         worlds.signal_phase[:] = shared.signal_phase
 
     def _select_agents(self, lines: NDArray[np.int32]) -> int:
-        """Put the rows of agents with lines (W, A, 2) first; return the number of these agents."""
+        """Put agents with non-empty `lines` (W, A, 2) first; return the number of these agents."""
         shared, worlds = self._shared, self._worlds
         return self._put_first(worlds.rows, shared.num_agents, lines, self._spare, worlds.num_owned)

@@ -138,7 +138,7 @@ class SensorWorkers:
         return self._costs_s.copy()
 
     def __call__(self, scenes: Sequence[SensedScene], turns: Sequence[Turn]) -> None:
-        """Write the samples of all turns."""
+        """Write the samples of all turns, each the work of one sensor in this tick."""
         theirs = [turn for turn in turns if not turn.sensor.stamps_itself]
         if not theirs:
             sense_here(scenes, turns)

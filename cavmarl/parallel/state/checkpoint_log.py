@@ -1,8 +1,8 @@
 """`CheckpointLog`: an occasional image of worlds, and the commands of the steps after it.
 
-Writing an image takes a tenth of a step; for ten thousand vehicles, it takes half as long as a tick
-that several workers share. The state and the commands determine a step, so a successor may resume
-from an older image and repeat the steps after it.
+Writing an image takes a tenth of the time of a step; for ten thousand vehicles, it takes half the
+time of a tick that several workers share. The state and the commands determine a step, so a
+successor may resume from an older image and repeat the steps after it.
 """
 
 from __future__ import annotations

@@ -37,10 +37,10 @@ class HostedZones:
         self._together = [ShardGroup(self._shards)] if self._shards else []
         self._alone: list[ShardGroup] = []
         self._untimed = -1  # tick in which the timed groups were made; its time does not count
-        self._sides: tuple[int, int] | None = None  # sides of the shards, if known
+        self._sides: tuple[int, int] | None = None  # buffers of rows, if known
 
     def set_sides(self, side: int, next_side: int) -> None:
-        """Set the sides of the current and the next rows, as another process announced them."""
+        """Set the buffers of the committed and the next rows, as another process announced them."""
         if self._sides != (side, next_side):
             self._sides = side, next_side
             for shard in self._shards:

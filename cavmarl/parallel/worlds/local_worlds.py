@@ -102,7 +102,7 @@ class LocalWorlds:
         return self.simulation.transfers
 
     def in_flight(self, world: int) -> Sequence[TransferInFlight]:
-        """Return the vehicles of a world whose next zone has their state already."""
+        """Return the incomplete transfers of a world: vehicles that are offered to another zone."""
         return self.simulation.zones.view(world).transfers
 
     def reset(self, seed: int | None, first_world: int) -> None:

@@ -41,7 +41,7 @@ class StepArrays(NamedTuple):
     # (W, A) the horizon of the episode or of the trip was reached; a trip ends with its vehicle
     truncations: NDArray[np.bool_]
     acted: NDArray[np.bool_]  # (W, A) agents that acted in the step
-    vehicle_done: NDArray[np.bool_]  # (W, A)
+    vehicle_done: NDArray[np.bool_]  # (W, A) the trip of the agent's vehicle has ended
     vehicle_ids: NDArray[np.int64]  # (W, A) agent's vehicle at the end of the step; -1: none
     mask: NDArray[np.bool_]  # (W, A) agents that act next
     terms: NDArray[np.float32]  # (W, A, T)
@@ -56,7 +56,7 @@ class StepArrays(NamedTuple):
     external: NDArray[np.float64]  # (W, E, K)
     overridden: NDArray[np.int32]  # (W, N, 2)
     lane_changes: NDArray[np.float64]  # (W, N, 3)
-    # Arrays of agents that control signals, or of other agents beside the road (`RoadsideAgents`):
+    # Arrays of S agents that control signals or are beside the road (`RoadsideAgents`):
     signal_choices: NDArray[np.int64]  # (W, S)
     signal_observations: NDArray[np.float32]  # (W, S, D) see `SignalOutputs`, also for the next 8
     signal_rewards: NDArray[np.float32]  # (W, S)

@@ -19,19 +19,19 @@ class Task(IntEnum):
     SUGGEST = 2
     STATE_HASH = 3
     TRAFFIC_STATS = 4
-    PACK = 5
-    UNPACK = 6
-    HOST = 7
+    PACK = 5  # write the worlds that leave a worker to its outbox
+    UNPACK = 6  # restart with the worlds that were kept and the new worlds
+    HOST = 7  # run other zones
     WRITE_STATES = 8
     DRIVEN = 9
     SIGNAL_PHASES = 10
     SAVE = 11
     LOAD = 12
-    LOADS = 13
-    PROPOSE = 14
-    CUT = 15
-    CHECK = 16
-    COSTS = 17
+    LOADS = 13  # report the load of a node, of its machine, or its connections
+    PROPOSE = 14  # propose zones with a better balance
+    CUT = 15  # change the zones
+    CHECK = 16  # check that saved worlds can be loaded
+    COSTS = 17  # report the costs of zones
 
 
 CHANGES = (Task.STEP, Task.RESET, Task.LOAD, Task.CUT)  # tasks that change worlds
@@ -88,7 +88,7 @@ def _saved(payload: list[bytes], first: int) -> dict[str, Any]:
     return {"saved": payload}
 
 
-# A process that does not pass saved worlds as bytes replaces these entries.
+# Processes that pass saved worlds in another form handle SAVE, LOAD and CHECK themselves.
 WORLD_TASKS: Mapping[Task, WorldTask] = {
     Task.STEP: WorldTask(_step, _nothing),
     Task.RESET: WorldTask(LocalWorlds.reset, shifted_reset),

@@ -1,4 +1,7 @@
-"""The phases of a tick, each as one kernel for all zones of a process, in the order of a tick."""
+"""The phases of a tick, each as one kernel for all zones of a process, in the order of a tick.
+
+Committed rows have the state at the start of the tick, and next rows the state at its end.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +52,7 @@ def retire(departures: DepartureQueue, worlds: Worlds, ticks_per_step: int) -> N
 
 @kernel
 def forget(departures: DepartureQueue, worlds: Worlds) -> None:
-    """Drop the ghosts of vehicles that have been retired."""
+    """Drop the ghosts of vehicles that `retire` has removed."""
     drop_ghosts(departures, worlds, worlds.rows)
 
 
@@ -91,7 +94,7 @@ forget_each = for_each_zone(forget)
 
 @kernel
 def turn(members: Members, ticks_in_order: int) -> None:
-    """Put the next rows into the other half of `ZoneState.rows`, in a tick that sorts rows."""
+    """In a tick that sorts rows, choose the other half of `ZoneState.rows` for the next rows."""
     if members.common.ticks[0] % ticks_in_order == 0:
         members.sides[NEXT] = 1 - members.sides[COMMITTED]
 

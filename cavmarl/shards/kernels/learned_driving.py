@@ -35,7 +35,8 @@ class LearnedDriver(NamedTuple):
     weights: NDArray[np.float32]
     accel_mps2: float  # acceleration at the action 1
     steering_rad: float  # angle of the front wheels at the action 1
-    # (D,) exchange of left and right as in `exchanged_sides`; (0,): trained on this side of roads
+    # (D,) how to exchange left and right in the D numbers of an observation, see `exchanged_sides`;
+    # (0,): not needed
     exchanged: NDArray[np.int64]
     signs: NDArray[np.float32]
     no_reports: NDArray[np.void]  # REPORT (0,), the empty inbox of each vehicle
@@ -118,7 +119,7 @@ def _act(rows: NDArray[np.void], num: int, learned: LearnedDriver) -> None:
 @kernel
 def drive_by_network(
     roads: RoadArrays,
-    plans: NDArray[np.void],  # PLAN (V, G, L)
+    plans: NDArray[np.void],  # PLAN (V, goals, lanes); V as in `Worlds.lanes`
     travel: TripTables,
     lane_grid: LaneGrid,
     worlds: Worlds,  # outputs: throttle, steering and memory of the owned committed rows

@@ -225,7 +225,7 @@ def _drive_in_background(
 @kernel
 def advance(
     roads: RoadArrays,
-    plans: NDArray[np.void],  # PLAN (V, G, L)
+    plans: NDArray[np.void],  # PLAN (V, goals, lanes); V as in `Worlds.lanes`
     travel: TripTables,
     lane_grid: LaneGrid,  # index of lanes by position
     worlds: Worlds,  # output: next_rows
@@ -321,7 +321,7 @@ def resolve(
 @kernel
 def suggest(
     roads: RoadArrays,
-    plans: NDArray[np.void],  # PLAN (V, G, L)
+    plans: NDArray[np.void],  # PLAN (V, goals, lanes); V as in `Worlds.lanes`
     travel: TripTables,
     worlds: Worlds,  # input only
     scratch: Scratch,

@@ -1,5 +1,7 @@
 """Frames about agents that processes exchange: rows of tables, actions, and results, as bytes.
 
+An agent has sensed in the process that has computed its newest observation.
+
 A frame of rows has the number of agents in 8 bytes, the index of each agent in 8 bytes, and then,
 agent by agent, the row of each table.
 
@@ -113,8 +115,8 @@ def note_own(
     present: Flags,  # (W, A) agents that have sensed in this process
     chosen: Flags,  # (W,) worlds to update
     number: int,  # number of this process
-    own: Flags,  # (W, A) output: agents that have sensed here last
-    mine: Flags,  # (W · A,) output: these agents in the chosen worlds
+    own: Flags,  # (W, A) output: `present`, in the worlds to update
+    mine: Flags,  # (W · A,) output: agents of `own` in the chosen worlds
     owner: Owners,  # (W · A,) output: `number`, or `UNOWNED`
 ) -> None:
     """Record which agents this process owns, according to its own knowledge."""
@@ -157,7 +159,7 @@ def pack_actions(
 
 @kernel
 def take_actions(
-    words: Words,  # begin with the frame
+    words: Words,  # the frame and following bytes
     numbers: NDArray[np.float64],  # the same memory
     controls: NDArray[np.float64],  # (A, 2) output
     meta_actions: NDArray[np.int64],  # (A,) output
@@ -170,7 +172,7 @@ def take_actions(
 
     Returns:
         The number of words, or -1 if `pack_actions` has not made the frame (then nothing is
-        written); the number of wrong agents; the number of agents that are still missing.
+        written); the number of agents in `wrong`; the number of agents in `missing`.
     """
     num_agents = missing.size
     if words.size < 2 or min(words[0], words[1]) < 0 or max(words[0], words[1]) > num_agents:

@@ -19,7 +19,7 @@ NEAR = np.dtype(
         ("source", np.int64),  # zone that owns the vehicle
         ("row", np.int64),  # index of its row in this zone
         ("target", np.int64),  # zone that contains the vehicle now or soon
-        ("crossed", np.bool_),  # whether it is beyond the hysteresis, outside of the source zone
+        ("crossed", np.bool_),  # whether it is in `target` now, beyond the hysteresis
         ("depth_m", np.float64),  # distance outside of the source zone; inside, the negative
         # distance to the target zone
     ],

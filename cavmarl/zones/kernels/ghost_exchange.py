@@ -37,8 +37,8 @@ def exchange(
     halo: Halo,  # from `partition.zone_halo.zone_halo`, for the same partition
     touching_m: float,  # a ghost farther outside of a zone cannot touch a vehicle of the zone
     borders: Borders,
-    # ghosts, their numbers, border and num_border are outputs. Only owned rows in the list `outer`
-    # are read; if the list is missing, it is made here
+    # outputs: ghosts, their numbers, border and num_border. Only rows in the list `outer`, which
+    # other zones may have to see, are read; if the list is missing, it is made here
     zoned: ZoneState,
     side: int,  # the buffer of rows, 0 or 1
     first: int,  # the first world

@@ -34,7 +34,7 @@ Floats = NDArray[np.float64]
 
 
 class Forecast(NamedTuple):
-    """The constants and the scratch memory of forecasts."""
+    """The constants and the scratch memory of forecasts. The step of a row is a PLAN record."""
 
     dt: float  # length of a tick in s
     ticks_per_step: int

@@ -49,7 +49,7 @@ def extend_paths(
     limit_m: float,  # limit of the length of a path
     # (L,) m, updated; finite where paths begin, inf elsewhere; values above the limit are kept
     ways: NDArray[np.float64],
-    scratch: VisibilityScratch,  # `waits` and `following` are used
+    scratch: VisibilityScratch,  # only `waits` and `following` are used
 ) -> None:
     """Extend the shortest paths along roads to all lanes within a limit; write their lengths."""
     head = -1

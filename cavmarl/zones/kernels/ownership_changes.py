@@ -28,7 +28,7 @@ COMING = np.dtype(
         ("epoch", np.int64),  # epoch of the current ownership
         ("tick", np.int64),  # first tick in which the vehicle was near
         ("depth_m", np.float64),  # distance outside of its owner's zone in that tick, see NEAR
-        ("ms", np.float64),  # clock time of that tick
+        ("ms", np.float64),  # clock time at the start of that tick, ms
     ],
     align=True,
 )
@@ -45,7 +45,7 @@ CHANGE = np.dtype(
         ("prepare_depth_m", np.float64),  # distance outside of the source's zone in that tick
         ("switch_depth_m", np.float64),  # the same distance at the change of owner
         ("release_depth_m", np.float64),  # the same one tick later; NaN: the vehicle has left
-        # duration since the first approach; until the tick ends, clock time of the first approach
+        # ms since the first approach; until the tick ends, clock time of the first approach in ms
         ("ms", np.float64),
     ],
     align=True,
@@ -67,7 +67,7 @@ BATCH_SIZE = 512
 """Size of a batch of rows to copy; larger than the largest number of zones."""
 
 UNREAD_LIMIT = 256
-"""As soon as this many changes are unread, they are read. A tick adds at most one per vehicle."""
+"""The coordinator reads changes once this many are unread. A tick adds at most one per vehicle."""
 
 
 class BorderRecords(NamedTuple):
@@ -77,14 +77,14 @@ class BorderRecords(NamedTuple):
     num_near: NDArray[np.int64]  # (W,) number of entries of `near`
     num_crossed: NDArray[np.int64]  # (W,) number of vehicles in `near` that have crossed
     owned: NDArray[np.int64]  # (W,) number of vehicles when `near` was made
-    coming: NDArray[np.void]  # COMING (W, 2, 2 C) near and not crossed; two alternating lists
+    coming: NDArray[np.void]  # COMING (W, 2, 2 C) near, not handed over; two alternating lists
     turn: NDArray[np.int64]  # (W,) index of the current list; the other is the previous tick's
     num_coming: NDArray[np.int64]  # (W, 2) number of entries of both lists
     known: NDArray[np.int64]  # (W,) entries of the current list that were in the previous list
     acknowledged: NDArray[np.int64]  # (W,) sum of the entries of `coming` in all earlier ticks
-    aborted: NDArray[np.int64]  # (W,) number of vehicles that have turned away or left
+    aborted: NDArray[np.int64]  # (W,) number of vehicles that have turned back or left the world
     tick: NDArray[np.int64]  # (W,) tick of the rows in which `near` was found
-    ms: NDArray[np.float64]  # (W,) clock time at the start of that tick
+    ms: NDArray[np.float64]  # (W,) clock time at the start of that tick, ms
     newborn: NDArray[np.int64]  # (W, C) ids that have entered since the last tick began
     changes: NDArray[np.void]  # CHANGE (W, C + UNREAD_LIMIT) that are not read yet
     num_changes: NDArray[np.int64]  # (W,) number of entries of `changes`
@@ -197,9 +197,10 @@ def hand_over(
 def _follow_swap(
     zoned: ZoneState, w: int, near: np.void, changed: int, book: BorderRecords
 ) -> None:
-    """Update the row of a vehicle that has moved into the row of a vehicle that left its zone.
+    """Update the recorded row of a vehicle that entered the zone `near["source"]` in this tick.
 
-    Both vehicles left their zone in this tick. Without the update, `release` would search all rows.
+    If a vehicle leaves a zone, the last row of the zone moves into its place. Without the update,
+    `release` would search all rows.
     """
     last = zoned.num_owned[near["source"], w]
     newest = book.num_changes[w] - 1

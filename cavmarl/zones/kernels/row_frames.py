@@ -3,7 +3,7 @@
 If another process hosts a zone, the zone has no owned rows here, and `exchange` writes only its
 ghosts. For a ghost that was in the previous frame, only words that differ from their forecast are
 sent.
-A ghost has V + S + 2 words: its row, its step, the place of the step, its world.
+A ghost has V + S + 2 words: its row (VEHICLE), its step (PLAN), its `step_at`, its world.
 
 A frame for a process with k zones in W worlds has these words:
 

@@ -17,7 +17,7 @@ class VisibilityScratch(NamedTuple):
     behind: NDArray[np.float64]  # (L,) distance from a lane's end to a vehicle with followers, m
     to_line: NDArray[np.float64]  # (L,) distance from a lane's end to the stop line of a foe, m
     to_room: NDArray[np.float64]  # (L,) distance from a lane's end to the line of a foe in `swept`
-    beyond: NDArray[np.float64]  # (L,) distance from a junction in `asked` to a lane, m
+    beyond: NDArray[np.float64]  # (L,) distance from the junction of a link in `asked` to a lane, m
     asked: NDArray[np.bool_]  # (K,) links that a driver of the zone may want to enter
     foe: NDArray[np.bool_]  # (K,) foes of the links in `asked`
     swept: NDArray[np.bool_]  # (K,) foes for which vehicles leave room

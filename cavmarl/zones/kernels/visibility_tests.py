@@ -31,8 +31,8 @@ from cavmarl.zones.kernels.visibility_scratch import VisibilityScratch
 from cavmarl.zones.kernels.zone_lookup import squared_distance
 
 AT_LINE_M = 0.2  # a vehicle within this distance of a line may be about to cross it
-ASIDE_M = 10.0  # limit of the distance, and of the difference in s, of adjacent places on an edge
-BACK_M = max(LOOK_BACK_M, ENTER_REACH_M)  # distance back to the end of lanes with followers
+ASIDE_M = 10.0  # places side by side on an edge differ by at most this, in the plane and in `s`
+BACK_M = max(LOOK_BACK_M, ENTER_REACH_M)  # followers' lanes end at most this far behind a zone
 ROUNDING_M = 0.1  # limit of rounding errors of sums over lanes and of float32
 
 
@@ -105,7 +105,7 @@ def _widen(looks: NDArray[np.void], lane: int, first: float, last: float, length
 
 @inlined_kernel
 def _longest_beside_m(roads: RoadArrays, lane: int) -> float:
-    """Return the length of adjacent lanes beside the junction at a lane's end; 0: no such lanes."""
+    """Return how many m adjacent lanes go on beside the junction at a lane's end; 0: none do."""
     further = 0.0
     for side in (roads.lanes[lane]["left"], roads.lanes[lane]["right"]):
         if side >= 0 and not roads.lanes[lane]["internal"]:

@@ -1,7 +1,7 @@
 """Halos: the areas beyond their borders that zones see.
 
-A halo is a distance (decision 012): a zone receives a ghost of every vehicle within this distance,
-even from zones that do not touch the zone.
+A halo is a distance (decision 012): zones can receive ghosts of vehicles within this distance, even
+from zones that do not touch them. `Visibility` leaves out vehicles that no driver considers.
 """
 
 from __future__ import annotations

@@ -159,7 +159,7 @@ def _bisected(area: _Area, rect: Rect, samples: Floats | None, count: int) -> li
 def _window(
     rect: Rect, samples: Floats | None, axis: int, share: float
 ) -> tuple[float, float, float] | None:
-    """Return the first allowed cut, the cut with `share` below it, and the last allowed cut.
+    """Return the first allowed, the wanted (`share` of the weight below) and the last allowed cut.
 
     Return None if no cut is allowed.
     """
