@@ -52,9 +52,9 @@ class _Spin:
         self._angle = 0.0
 
     def next(self, elapsed_s: float) -> tuple[float, list[tuple[float, float, int]]]:
-        """Return the angle at the start and the parts of a scan.
+        """Return the angle at the start and the parts of a scan, in rad, clockwise.
 
-        A part is the azimuth of its first column, the step, and the number of columns, clockwise.
+        A part is the azimuth of its first column, the angle between columns, and their number.
         """
         started = self._angle
         columns = round(self._points_per_s * elapsed_s / self.channels)
@@ -308,7 +308,7 @@ class AttachedCamera:
         raise NotImplementedError
 
     def bodies(self, context: SensorContext) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-        """Return which pixels (H, W) show vehicles or walkers, and the ids (n,) of their rows."""
+        """Return which pixels (H, W) show vehicles or walkers, and the vehicle id (n,) of each."""
         surroundings = context.surroundings
         prisms = surroundings.panorama.prisms
         body = (self.lens.picture_of(surroundings).face - FIRST_FACE) // _FACES_OF_PRISM

@@ -81,7 +81,7 @@ def _answer(caller: Caller, session: CarlaSession, index: int, body: list[Any]) 
 def _carry_out(
     caller: Caller, session: CarlaSession, index: int, body: list[Any], spawned: int = 0
 ) -> int:
-    """Carry out a command; return its actor. `spawned`: the actor that 0 stands for."""
+    """Carry out a command; return its actor. `spawned`: the actor that replaces the number 0."""
     if index == _SPAWN:
         if spawned:
             raise CallRefused("a spawn command after a spawn command")

@@ -124,8 +124,8 @@ class ActorTable:
     """The actors of one episode, and their states as records of a snapshot.
 
     `first_number`: number of the first actor, larger than all numbers of earlier episodes, because
-    clients remember actors by their numbers. `next_number`: smallest number of the first vehicle.
-    `known`: actors of vehicles that may appear, by the ids of the vehicles.
+    clients remember actors by their numbers. `next_number`: lower bound of the numbers of vehicles.
+    `known`: actors, by vehicle id, that keep their numbers when these vehicles appear.
     """
 
     def __init__(

@@ -371,7 +371,7 @@ BLUEPRINTS = {
     )
 }
 
-# The blueprint of vehicles of the world, by the class that cameras see.
+# The blueprint of vehicles that no client has spawned, by their class in semantic pictures.
 BLUEPRINT_OF_CLASS = {
     CAR: "vehicle.tesla.model3",
     TRUCK: "vehicle.carlamotors.carlacola",
