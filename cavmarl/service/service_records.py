@@ -138,11 +138,11 @@ class Infrastructure:
     )  # jobs without a node, in order of arrival
     # hash of content → number of configurations, artefacts, states and results that refer to it
     users: Counter[str] = field(default_factory=Counter)
-    # content without users that `take_unused` has not returned yet
+    # content without references that `take_unused` has not returned yet
     unused: set[str] = field(default_factory=set, compare=False)
 
     def take_unused(self) -> set[str]:
-        """Return the content that has lost its last user since the last call."""
+        """Return the content that has lost its last reference since the last call."""
         found, self.unused = self.unused, set()
         return found
 

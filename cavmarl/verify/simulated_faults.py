@@ -24,7 +24,7 @@ JUMP_S = 0.3  # longest jump of a clock
 NODE_KINDS = (FrameKind.REPORT, FrameKind.MESSAGES, FrameKind.SHARE, FrameKind.KEEP)
 RECOVERY_KINDS = (FrameKind.SYNC, FrameKind.REPORT, FrameKind.GIVE, FrameKind.MISSED)
 CALLER_KINDS = (FrameKind.COMMAND, FrameKind.RECOVER)
-LATER_FRAMES = 4  # a process dies at one of this many next frames of a kind
+LATER_FRAMES = 4  # a process dies in one of its next frames of a kind; largest number of these
 
 
 class Fault(StrEnum):

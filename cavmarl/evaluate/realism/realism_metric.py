@@ -114,7 +114,7 @@ def _derivatives_valid(valid: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDA
 
 
 def _log_likelihoods(component: MetricComponent, values: Numbers, samples: Numbers) -> Numbers:
-    """Return (E, T) the log-likelihoods of values (E, T), given samples (E, R, T); NaN: missing."""
+    """Return (E, T) log-likelihoods of values (E, T), by samples (E, R, T) of R rollouts."""
     low, high, bins = component.low, component.high, component.bins
     edges = np.linspace(low, high, bins + 1)
     found = np.full(values.shape, np.nan)
