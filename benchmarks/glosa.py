@@ -1,4 +1,6 @@
-"""Effect of speed advice before signals: stops, standing and speed of agents that follow `glosa`.
+"""Effect of speed advice before signals: stops, standing time and speed of agents.
+
+The drivers `idm` (no advice) and `glosa` (green light optimal speed advisory) are compared.
 
 Source of the CO₂: `driving.kernels.emissions`.
 """
@@ -44,7 +46,7 @@ class Driving(NamedTuple):
 
 
 def drive(policy: str, env: str = "grid4x4", **arguments: Any) -> Driving:
-    """Return the sums over worlds of `drive_worlds`."""
+    """Return the results of `drive_worlds`, summed over its worlds."""
     found = np.sum(drive_worlds(policy, env, **arguments), axis=0)
     return Driving(*found.tolist())
 

@@ -33,7 +33,7 @@ from cavmarl.service.snapshots import SNAPSHOT_EVENTS
 
 CONFIGURATION = "0" * 64
 NODES_AN_IDENTITY = 100  # the rate limit is per identity
-SESSION_S, NODE_S = 600.0, 7200.0  # mean durations
+SESSION_S, NODE_S = 600.0, 7200.0  # mean time until a session ends; until a node fails
 FLUSHED_EVERY = 20  # simulated seconds between flushes of the log
 
 

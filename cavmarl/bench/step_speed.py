@@ -59,7 +59,9 @@ class Row:
     """Measurements of one way to step one kind of world."""
 
     sensors: str  # `lidar` (with neighbours) or `kinematics`
-    side: str  # `batched`, `single`, `dicts`, `more`, `highway_env` or `highway_env_raw`
+    # cavmarl: `batched`, `single` (one world), `more` (agents), `dicts` (PettingZoo);
+    # highway-env: `highway_env`, or `highway_env_raw` (observations are not normalised)
+    side: str
     agents: int  # controlled vehicles per world
     worlds: int  # worlds stepped together
     low: float  # agent-steps per second, slowest turn
