@@ -31,7 +31,7 @@ from cavmarl.service.request_bodies import BeatBody, NodeBody
 from cavmarl.service.service_records import Infrastructure
 from cavmarl.service.snapshots import SNAPSHOT_EVENTS
 
-CONFIGURATION = "0" * 64
+CONFIGURATION = "0" * 64  # hash of a configuration that need not exist
 NODES_AN_IDENTITY = 100  # the rate limit is per identity
 SESSION_S, NODE_S = 600.0, 7200.0  # mean time until a session ends; until a node fails
 FLUSHED_EVERY = 20  # simulated seconds between flushes of the log

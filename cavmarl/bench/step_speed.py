@@ -35,7 +35,7 @@ from cavmarl.env.vector import CavVectorEnv, make_vec
 __all__ = ["MORE", "Row", "StepSpeed", "measure_step_speed", "one_core"]
 
 OUR_STEPS = 100  # number of steps from a reset; no vehicle reaches the end of the road
-THEIR_STEPS = 10
+THEIR_STEPS = 10  # the same for highway-env
 MORE = 10  # factor of agents and of road length in the larger world
 MAX_AGENTS = 1000
 

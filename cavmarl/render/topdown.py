@@ -73,8 +73,8 @@ class Window:
 FOLLOW_M = 150.0
 FOLLOW_SHARE = 0.12
 MARGIN_PX = 50.0  # margin for the overlays in the corners
-STILL_DETAIL = 4
-MOVING_DETAIL = 2
+STILL_DETAIL = 4  # factor by which the ground is drawn larger, then reduced
+MOVING_DETAIL = 2  # the same while the camera follows vehicles
 
 
 class TopDownRenderer:

@@ -30,7 +30,7 @@ ALGORITHM = "EdDSA"
 ACCESS_S = 900.0
 REFRESH_S = 8 * 3600.0
 KEYS_KEPT = 2  # keys whose tokens are accepted: the current and the previous one
-MOST_VERIFIED = 10_000
+MOST_VERIFIED = 10_000  # tokens in the cache of checked signatures
 STATE_S = 3600.0  # validity of the signature of a state; exceeds any difference between clocks
 
 Admit = Callable[[str], None]

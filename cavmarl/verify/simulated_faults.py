@@ -18,7 +18,7 @@ from cavmarl.verify.simulated_machine import (
 )
 
 SKEW_S = 1e6  # limit of the offset of a clock
-CLOCK_RATES = (0.8, 1.25)
+CLOCK_RATES = (0.8, 1.25)  # limits of the rate of a clock, s per simulated s
 JUMP_S = 0.3  # longest jump of a clock
 
 NODE_KINDS = (FrameKind.REPORT, FrameKind.MESSAGES, FrameKind.SHARE, FrameKind.KEEP)

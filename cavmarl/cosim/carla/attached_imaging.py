@@ -28,9 +28,9 @@ CAMERA_RANGE_M = 300.0
 _DEPTH_RANGE_M = 1000.0  # depth of pixels without an object
 _DEPTH_STEPS = (1 << 24) - 1
 _FACES_OF_PRISM = 6
-_MAX_PIXELS = 4096
+_MAX_PIXELS = 4096  # on each side of a picture
 _MAX_POINTS = 10_000_000
-_ROAD_TAG, _BUILDING_TAG = 1, 3
+_ROAD_TAG, _BUILDING_TAG = 1, 3  # CARLA's semantic tags
 _TAGS = {NOTHING: 11, GROUND: 10, ROAD: _ROAD_TAG, LANE_LINE: 24, BUILDING: _BUILDING_TAG}
 
 TAGS = np.zeros(NUM_SEMANTICS, np.uint8)  # CARLA's tag of each class

@@ -20,7 +20,7 @@ from cavmarl.cosim.carla.call_table import CALLS, Caller, Returns, call
 from cavmarl.cosim.carla.carla_session import CarlaSession
 
 MAX_COMMANDS = 1 << 14
-_SPAWN, _DESTROY, _LIGHTS, _CONSOLE = 0, 1, 18, 20
+_SPAWN, _DESTROY, _LIGHTS, _CONSOLE = 0, 1, 18, 20  # CARLA's numbers of commands
 _CALL_OF_COMMAND = {
     2: "apply_control_to_vehicle",
     3: "apply_ackermann_control_to_vehicle",

@@ -32,9 +32,9 @@ _ADAPTERS: dict[type, TypeAdapter[Any]] = {}  # cached, as they are slow to cons
 _CLOSED = ConfigDict(extra="forbid")
 
 VERSION = 4
-MAX_LETTER = 1 << 22
-MAX_DATA = 1 << 28
-MAX_VEHICLES = 4096
+MAX_LETTER = 1 << 22  # bytes of a payload
+MAX_DATA = 1 << 28  # bytes of the arrays of one message
+MAX_VEHICLES = 4096  # vehicles that one follower may request
 MAX_POSES = 4096  # maximum number for one actor in a message
 
 

@@ -25,9 +25,9 @@ _ROAD_M = 2.5  # maximum distance of an echo from the centre of a lane
 _BESIDE_ROAD_M = 6.0  # the same for pedestrians, who may step onto the road
 _MATCH_M = 3.0  # maximum distance between an object and its predicted position
 _SAME_M = 0.5  # the same, if the object is to keep the kind of an earlier detection
-_ALPHA, _BETA = 0.5, 0.2
-_FORGET_S = 0.5
-_STILL_MPS = 0.6
+_ALPHA, _BETA = 0.5, 0.2  # gains of the alpha-beta filter
+_FORGET_S = 0.5  # an object that is not detected for this time is forgotten
+_STILL_MPS = 0.6  # slower objects are reported as stopped
 _FEW = 3  # detections before a velocity is used
 
 

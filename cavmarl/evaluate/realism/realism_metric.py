@@ -22,7 +22,7 @@ Numbers = NDArray[np.float64]
 YEAR = 2024
 ROLLOUTS = 32
 _SMOOTHING = 0.1  # added to each bin
-_EVENT_SMOOTHING = 0.001
+_EVENT_SMOOTHING = 0.001  # added to the counts of rollouts with and without the event
 
 
 class MetricComponent(NamedTuple):
@@ -145,7 +145,7 @@ def _mean_likelihood(name: str, likelihoods: Numbers, valid: NDArray[np.bool_]) 
 def _event_likelihood(
     name: str, log: RolloutFeatures, rollouts: Sequence[RolloutFeatures], first: int
 ) -> float:
-    """Return the likelihood of whether objects collided, or left the road, while logged."""
+    """Return the likelihood, by rollouts, that each object has or lacks the event as in the log."""
     kind = "collided" if name == "collision_indication" else "off_road"
     seen = log.valid[:, first:]
     happened = (getattr(log, kind)[:, first:] & seen).any(axis=1)
