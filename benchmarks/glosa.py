@@ -1,8 +1,7 @@
-"""Effect of speed advice before signals: stops, standing time and speed of agents.
+"""Effect of speed advice before signals: stops, standing and speed of agents that follow `glosa`.
 
-The drivers `idm` (no advice) and `glosa` (green light optimal speed advisory) are compared.
-
-Source of the CO₂: `driving.kernels.emissions`.
+`glosa`: green light optimal speed advisory, a driver of the library. Source of the CO₂:
+`driving.kernels.emissions`.
 """
 
 from __future__ import annotations

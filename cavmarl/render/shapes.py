@@ -90,7 +90,7 @@ DASH_PERIOD_M = 9.0
 # A road that is higher than another one by this much is drawn over it.
 LEVEL_M = 4.0
 STOP_LINE_M = 0.7
-# If a hull is larger than this multiple of the area of its paths, it also contains land.
+# A hull larger than this multiple of the area of its paths contains land, and is not filled.
 MAX_HULL_SHARE = 1.2
 MIN_HULL_M2 = 150.0  # added to that limit, so that smaller hulls are always filled
 # SUMO's link directions from left to right: left, half left, straight, half right, right. A U-turn

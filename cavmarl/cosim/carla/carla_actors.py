@@ -74,6 +74,7 @@ class CarlaActor:
     """One actor.
 
     Attributes:
+        number: CARLA's id of the actor; `parent`: that of its parent, or 0.
         attributes: values by name; kinds as in the blueprint.
         pose: the current pose; for vehicles and walkers, see `ActorTable.pose_of`.
         local: pose relative to the parent.

@@ -37,10 +37,10 @@ class _Group:
     """The phase of a signal that clients time. Phases are numbered from the first of a program."""
 
     first: int  # PHASE row
-    following: list[int]
+    following: list[int]  # next phase of each phase
     durations_s: NDArray[np.float64]  # duration of each phase
-    phase: int
-    elapsed_s: float
+    phase: int  # current phase
+    elapsed_s: float  # time in the current phase
     is_frozen: bool = False
 
     def advance(self, step_s: float) -> bool:

@@ -39,8 +39,8 @@ class _Track:
     y_m: float
     vx_mps: float
     vy_mps: float
-    seen_s: float
-    times: int
+    seen_s: float  # time of the last detection
+    times: int  # number of detections
     kind: str
 
 

@@ -67,13 +67,13 @@ class EvacuationResult:
     all: AreaResult
     exits: dict[str, int]  # arrivals at each exit
     longest_queue: int  # largest number of vehicles stopped at the same time
-    mean_queue: float
+    mean_queue: float  # mean number of stopped vehicles over the samples
     queues: dict[str, int]  # longest queues: largest number of stopped vehicles by road
     # time in s from the last opening of a road until the number of stopped vehicles is about as
     # low as before the first closure; None: no closure ended, or traffic did not recover
     recovery_s: float | None
-    deadlocks: tuple[tuple[int, ...], ...]  # deadlocks at the end
-    rerouted: int
+    deadlocks: tuple[tuple[int, ...], ...]  # ids of vehicles that wait for each other at the end
+    rerouted: int  # changes of route; one vehicle may count several times
     contacts: int  # number of vehicles that began to touch another vehicle
     # roads and junctions with most contacts → vehicles in contact, summed over the samples
     contact_places: dict[str, int]
