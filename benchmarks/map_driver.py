@@ -253,7 +253,7 @@ class MapDriver:
         objects: Sequence[Seen],
         lights: Mapping[int, frozenset[int]],
     ) -> list[tuple[float, str]]:
-        """Return the accelerations before lines at which the vehicle has to stop."""
+        """Return accelerations before lines at which the vehicle has to stop, with reasons."""
         found = []
         for n, piece in enumerate(pieces[1:], 1):
             line_m = piece.begin_m - front_m

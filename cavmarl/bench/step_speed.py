@@ -133,7 +133,7 @@ def compare(road_m: float, repeats: int, rows: list[Row]) -> StepSpeed:
 def our_sides(
     folder: Path, road_m: float, agents: int, worlds: int
 ) -> dict[tuple[str, str], tuple[int, int, Callable[[], float]]]:
-    """Return agents, worlds and rate of each cavmarl side, stepped twice before measuring."""
+    """Return agents, worlds and a function that measures the rate, by sensors and side."""
     sides: dict[tuple[str, str], tuple[int, int, Callable[[], float]]] = {}
     for sensors, side, times, is_batched in OURS:
         count, together = times * agents, worlds if is_batched else 1

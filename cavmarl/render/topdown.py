@@ -256,7 +256,7 @@ class TopDownRenderer:
 
 
 def _edge_ends(network: RoadNetwork, edges: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Return the ends of edges (…), (…, 2) m: the mean of their lanes' last points."""
+    """Return the end (…, 2) in m of each edge (…): the mean of its lanes' last points."""
     ends = np.zeros((*edges.shape, 2))
     for row, edge in np.ndenumerate(network.edges[edges]):
         first = edge["first_lane"]

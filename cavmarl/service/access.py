@@ -50,7 +50,7 @@ class Access:
     def add_identity(
         self, name: str, role: Role, actor: str = "service"
     ) -> tuple[IdentityRecord, str]:
-        """Create an identity and return its secret, which cannot be shown again."""
+        """Create an identity; return it and its secret, which cannot be shown again."""
         there = [one for one in self._log.state.identities.values() if one.name == name]
         if any(not one.revoked for one in there):
             raise problem("conflict", f"identity '{name}' exists already: choose another name")

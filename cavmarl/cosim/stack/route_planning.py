@@ -124,7 +124,7 @@ class LaneRoute:
     def _way(
         self, here: OnLane, plan: NDArray[np.void]
     ) -> tuple[list[int], list[float], NDArray[np.float64], float | None]:
-        """Return the lanes ahead, their starts, their points, and the end of the route."""
+        """Return the lanes ahead, their starts (m), the route's points, and where to wait (m)."""
         lanes, starts = [here.lane], [-here.s_m]
         pieces = [self._map.polyline(here.lane, here.s_m)]
         reached = float(self._network.lanes["length_m"][here.lane]) - here.s_m
@@ -132,7 +132,7 @@ class LaneRoute:
         while reached < _AHEAD_M:
             following = int(plan["next"][lanes[-1]])
             if plan["change"][lanes[-1]] != 0 or following < 0:
-                # If a lane has to be left, its end is a place to wait.
+                # If a lane change is needed, the end of the lane is the place to wait for it.
                 ends = reached if plan["change"][lanes[-1]] != 0 else None
                 break
             lanes.append(following)
@@ -306,7 +306,7 @@ def _bends(points: NDArray[np.float64]) -> list[tuple[float, float]]:
 def _beside(
     points: NDArray[np.float64], x_m: float, y_m: float
 ) -> tuple[float, float, float, float]:
-    """Return s and d of a place relative to a route, and the route's direction there."""
+    """Return s and d of a place relative to a route, and cos and sin of the route's heading."""
     steps = np.diff(points, axis=0)
     lengths = np.hypot(steps[:, 0], steps[:, 1])
     units = steps / lengths[:, None]
