@@ -5,9 +5,9 @@ The bias of the fixes, east and north, is part of the state. `GnssInertial` assu
 
 The model is that of Thrun, Burgard, Fox: "Probabilistic Robotics", 2005, chapter 3.3, with the
 kinematic bicycle's slip angle: the centre moves at heading + asin(r L / 2 v) where r is the yaw
-rate and L the length between the axles. The first fix gives the position. The heading is the
-direction of the lane there, reversed if the fixes move the other way. If a sensor detects lane
-markings, they give the distance from the centre of the lane.
+rate and L the wheelbase, here the vehicle's length. The first fix gives the position. The heading
+is the direction of the lane there, reversed if the fixes move the other way. If a sensor detects
+lane markings, they give the distance from the centre of the lane.
 """
 
 from __future__ import annotations
