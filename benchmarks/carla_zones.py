@@ -1,7 +1,7 @@
 """Hand-overs between zones that servers for CARLA's client run: rates and latencies.
 
-The benchmark repeats the hand-overs of the first paper (Table 4). Each zone of a world has a
-process with a server, and a process with CARLA's official client.
+The benchmark repeats the hand-overs of paper A, Table 4 (`docs/explanation/papers.md`). Each zone
+of a world has a process with a server, and a process with CARLA's official client.
 """
 
 from __future__ import annotations

@@ -23,9 +23,9 @@ Floats = NDArray[np.float64]
 class LoggedTick(NamedTuple):
     """The other load on a worker, and the cost and time of its shards in seconds per tick."""
 
-    use: Utilisation
-    load_s: float
-    tick_s: float
+    use: Utilisation  # by other programs
+    load_s: float  # cost of the shards
+    tick_s: float  # time of the shards
 
 
 class ShardContent(NamedTuple):

@@ -1,6 +1,7 @@
 """Effect of speed advice before signals: stops, standing and speed of agents that follow `glosa`.
 
-Source of the CO₂: `driving.kernels.emissions`.
+`glosa`: green light optimal speed advisory, a driver of the library. Source of the CO₂:
+`driving.kernels.emissions`.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ class Driving(NamedTuple):
 
 
 def drive(policy: str, env: str = "grid4x4", **arguments: Any) -> Driving:
-    """Return the sums over worlds of `drive_worlds`."""
+    """Return the results of `drive_worlds`, summed over its worlds."""
     found = np.sum(drive_worlds(policy, env, **arguments), axis=0)
     return Driving(*found.tolist())
 

@@ -20,15 +20,15 @@ from cavmarl.cosim.stack.stack_types import EgoPose, Mission, Trajectory
 
 LENGTH_M, WIDTH_M, WHEELBASE_M = 5.0, 2.0, 5.0  # dimensions of the driven vehicle
 AHEAD_M = 90.0
-ACCEL, BRAKE, HARDEST = 1.5, 2.5, 6.0  # m/s²
+ACCEL, BRAKE, HARDEST = 1.5, 2.5, 6.0  # m/s²; the last is the maximum braking
 HEADWAY_S, GAP_M = 1.4, 2.5
-BEND_MPS2 = 1.8  # lateral acceleration
+BEND_MPS2 = 1.8  # maximum lateral acceleration in bends
 BESIDE_M = 0.4  # distance to objects beside the way
 LINE_M = 1.0  # distance of the front to a line when stopped
-SIGHT_M = 60.0  # distance before a line up to which foes count
-MARGIN_S = 1.5
+SIGHT_M = 60.0  # maximum distance to a line that the driver considers, its own or a foe's
+MARGIN_S = 1.5  # a foe must arrive at least this long after the driver has passed
 PATIENCE_S = 20.0  # waiting time after which standing foes do not count
-GREEN, AMBER = 3, 2
+GREEN, AMBER = 3, 2  # colours of Autoware's TrafficLightElement
 
 
 class Seen(NamedTuple):
@@ -253,7 +253,7 @@ class MapDriver:
         objects: Sequence[Seen],
         lights: Mapping[int, frozenset[int]],
     ) -> list[tuple[float, str]]:
-        """Return the accelerations before lines at which the vehicle has to stop."""
+        """Return accelerations before lines at which the vehicle has to stop, with reasons."""
         found = []
         for n, piece in enumerate(pieces[1:], 1):
             line_m = piece.begin_m - front_m

@@ -19,8 +19,8 @@ from cavmarl.bench.harness import BenchmarkReport, Say, numbers_of, paired_inter
 from cavmarl.cli.output import about
 from cavmarl.core.errors import ConfigError
 
-PREDICTED = (10_000, 100_000, 1_000_000, 10_000_000)
-OVER = (1, 2, 4, 16, 64, 256)
+PREDICTED = (10_000, 100_000, 1_000_000, 10_000_000)  # numbers of vehicles
+OVER = (1, 2, 4, 16, 64, 256)  # numbers of nodes
 
 
 def measure(

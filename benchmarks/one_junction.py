@@ -18,7 +18,7 @@ from cavmarl.cli.output import about
 from cavmarl.core.errors import ConfigError, require
 from cavmarl.evaluate.traffic.traffic_comparison import compare_traffic
 
-# Kind of junction: vehicles per hour and arm that go straight on, left and right.
+# Kind of junction → its flows: vehicles per hour and arm that go straight on, left and right.
 FLOWS: dict[str, tuple[tuple[int, int, int], ...]] = {
     "traffic_light": ((900, 0, 0), (0, 300, 0), (0, 0, 600), (300, 150, 0), (300, 0, 150)),
     "priority": ((150, 60, 60), (80, 30, 30)),

@@ -27,9 +27,9 @@ from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
 
 TRIES = 8  # attempts to find a load
-TRIED_STEPS = 12
+TRIED_STEPS = 12  # number of warm-up steps, and of measured steps, of an attempt
 MARGIN = 1.15  # margin above the requested load
-TOO_MUCH = 1.5
+TOO_MUCH = 1.5  # largest accepted time / requested time
 
 # Upper limits of a sensor's settings; see `config/rig.py`.
 _LIMITS = {"rays": 8192, "layers": 128, "width": 4096, "height": 4096}

@@ -97,8 +97,8 @@ class SensorBench:
     def shares(self, workers: int) -> dict[str, Shares]:
         """Return both placements of all sensors of one vehicle, by their measured costs.
 
-        The placements assume that all lines of a frame have equal costs. At run time, the division
-        of frames is corrected by measured costs.
+        The placements assume that all lines of a frame (rows of pixels, or rays) have equal costs.
+        At run time, the division of frames is corrected by measured costs.
         """
         costs_ms = self.costs_ms
         num_lines = [sensor["lines"] for sensor in self.turns[0].run.sensors]

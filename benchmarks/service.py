@@ -31,9 +31,9 @@ from cavmarl.service.request_bodies import BeatBody, NodeBody
 from cavmarl.service.service_records import Infrastructure
 from cavmarl.service.snapshots import SNAPSHOT_EVENTS
 
-CONFIGURATION = "0" * 64
+CONFIGURATION = "0" * 64  # hash of a configuration that need not exist
 NODES_AN_IDENTITY = 100  # the rate limit is per identity
-SESSION_S, NODE_S = 600.0, 7200.0  # mean durations
+SESSION_S, NODE_S = 600.0, 7200.0  # mean time until a session ends; until a node fails
 FLUSHED_EVERY = 20  # simulated seconds between flushes of the log
 
 
@@ -158,7 +158,7 @@ def _beats(store: Path, nodes: int, seconds: int) -> tuple[float, float]:
 async def _beat(
     url: str, granted: list[str], nodes: int, seconds: int, process: psutil.Process
 ) -> tuple[float, float]:
-    """Send heartbeats of nodes; each connection has the nodes of one identity, in turn."""
+    """Send heartbeats; each connection has the nodes of one identity. Return as `_beats`."""
     tokens = []
     async with httpx.AsyncClient(base_url=f"{url}/v1") as http:
         for secret in granted:

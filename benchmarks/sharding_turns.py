@@ -51,13 +51,13 @@ class Turn:
 
 @dataclass(frozen=True)
 class Pair:
-    """One turn of all worlds; times are in ns per vehicle and tick."""
+    """One turn of the worlds of a `TwinWorlds`; times are in ns per vehicle and tick."""
 
     plain: Turn  # world without a stopwatch
     timed: Turn  # world with a stopwatch
-    plain_ns: float  # per tick, without a stopwatch
-    timed_ns: float  # per tick with a stopwatch, minus the stopwatch's own time
-    checked_ns: float | None  # per tick with the monitor; None: not measured
+    plain_ns: float  # without a stopwatch
+    timed_ns: float  # with a stopwatch, minus the stopwatch's own time
+    checked_ns: float | None  # with the monitor of invariants; None: not measured
     phases: dict[str, float]  # times by the names of `PHASES`; their sum is `timed_ns`
     calls: dict[str, float]  # times by the names of the runtime's calls
 

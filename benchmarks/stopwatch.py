@@ -20,7 +20,7 @@ class Stopwatch:
         self.calls: Counter[str] = Counter()
         self._inside = self._around = 0.0
         trials = [self._time_empty_calls() for _ in range(TRIALS)]
-        # other programs only lengthen a trial, so the shortest trial is the best
+        # take the shortest trial, because other programs can only lengthen a trial
         self._inside = min(inside for inside, _ in trials)
         self._around = min(around for _, around in trials)
 

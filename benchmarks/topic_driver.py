@@ -41,14 +41,14 @@ KINDS = {
     GOAL: "geometry_msgs/msg/PoseStamped",
 }
 CONTROL, CONTROL_KIND = "/control/command/control_cmd", "autoware_control_msgs/msg/Control"
-ENDS_S = 3.0  # ends after this time without a publisher of the clock
+ENDS_S = 3.0  # the program ends after this time without a publisher of the clock
 MISSES_S = 5.0  # the driver reports messages that are missing for this time
 
 
 class TopicDriver:
     """The node with its received messages.
 
-    `step_s`: time between two clocks.
+    `step_s`: simulated time between two messages of the clock.
     """
 
     def __init__(self, folder: Path, domain: int, step_s: float) -> None:

@@ -1,7 +1,8 @@
 """Cost of messages per tick, for several channels with the vehicles of one world.
 
-The world itself has no messages. After each of its ticks, the message bus of each channel sends and
-receives with the world's rows. So all channels are timed under the same conditions.
+The world itself has no messages. After each of its ticks, one message bus for each channel (the
+object that sends and receives messages) runs with the world's vehicles. So all channels are timed
+under the same conditions.
 """
 
 from __future__ import annotations
@@ -118,7 +119,7 @@ def _row(name: str, found: V2xStatistics, every_ms: list[float], warmup: int) ->
 
 
 def _bus_beside(simulation: Simulation, config: EnvConfig) -> tuple[Bus, Callable[[], None]]:
-    """Return a bus that is separate from a world's stations, and a function that runs it once."""
+    """Return a message bus beside a world, which has none, and a function that runs it once."""
     division, worlds = simulation.division, simulation.shards[0].worlds
     bus = Bus(config, simulation.network, simulation.types, division.zoned, common_of(worlds))
     return bus, lambda: bus.exchange(division.side)

@@ -58,7 +58,7 @@ FEATURES = frozenset(
     (*KINDS, *NARROW, *JUNCTIONS, *SIGNALS, *SHARES, *LEVELS, *MIXES, "fringe", "everywhere")
 )
 _SPEEDS_MPS = (8.33, 13.89, 13.89, 19.44, 27.78)
-_LANES = (1, 1, 2, 2, 3, 4)
+_LANES = (1, 1, 2, 2, 3, 4)  # numbers of lanes; each entry is equally likely
 
 
 @dataclass(frozen=True)

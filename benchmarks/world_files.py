@@ -25,7 +25,7 @@ NET_FILE, ROUTES_FILE = "world.net.xml", "world.rou.xml"
 GAME_MAPS = ("kuehne/kuehne", "bs3d/bs", "fokr_bs_demo/fokr_bs", "DRT/osm", "fkk_in/ingolstadt")
 _DRAWN_TRIPS = 1500  # number of trips that randomTrips draws
 _LEAST_EDGES = 12  # cuts with fewer edges are drawn again
-_CUTS = 20
+_CUTS = 20  # attempts to cut a piece with roads
 _END_PER_H = 600.0  # upper bound of the flow on a road into the net, so that vehicles can enter
 _TOOL_S = 300.0
 

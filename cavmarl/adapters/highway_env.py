@@ -321,7 +321,7 @@ def _map(task: HighwayTask, config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _half(name: str, settings: Mapping[str, Any], usual: float) -> float:
-    """Return the upper limit of an action's range, for which the action 1 stands."""
+    """Return the upper limit of a symmetric range; the action 1 stands for it."""
     low, high = settings.get(name, (-usual, usual))
     if low != -high or high <= 0.0:
         raise ConfigError(f"action.{name} = [{low}, {high}]: must be symmetric, like [-5, 5]")

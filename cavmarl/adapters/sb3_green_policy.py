@@ -1,4 +1,4 @@
-"""`GreenPolicy`: a policy of stable-baselines3 that scores the greens of signals of any shape.
+"""`GreenPolicy`: a policy of stable-baselines3 for signals with any numbers of lanes and greens.
 
 `SharedNetwork` is a controller that uses a trained policy of this kind.
 

@@ -20,7 +20,7 @@ LANES = 4
 LANE_WIDTH_M = 3.2
 SPEED_MPS = 30.0
 RUN_OUT_M = 1500.0
-IDLE = 1
+IDLE = 1  # number of the meta-action in highway-env
 
 # Sensors of cavmarl in addition to ego and signal. In highway-env, the lidar observation has no
 # neighbours, no observation has a route, and `Kinematics` has four neighbours by default.

@@ -35,7 +35,7 @@ from cavmarl.env.vector import CavVectorEnv, make_vec
 __all__ = ["MORE", "Row", "StepSpeed", "measure_step_speed", "one_core"]
 
 OUR_STEPS = 100  # number of steps from a reset; no vehicle reaches the end of the road
-THEIR_STEPS = 10
+THEIR_STEPS = 10  # the same for highway-env
 MORE = 10  # factor of agents and of road length in the larger world
 MAX_AGENTS = 1000
 
@@ -59,7 +59,9 @@ class Row:
     """Measurements of one way to step one kind of world."""
 
     sensors: str  # `lidar` (with neighbours) or `kinematics`
-    side: str  # `batched`, `single`, `dicts`, `more`, `highway_env` or `highway_env_raw`
+    # cavmarl: `batched`, `single` (one world), `more` (agents), `dicts` (PettingZoo);
+    # highway-env: `highway_env`, or `highway_env_raw` (observations are not normalised)
+    side: str
     agents: int  # controlled vehicles per world
     worlds: int  # worlds stepped together
     low: float  # agent-steps per second, slowest turn
@@ -131,7 +133,7 @@ def compare(road_m: float, repeats: int, rows: list[Row]) -> StepSpeed:
 def our_sides(
     folder: Path, road_m: float, agents: int, worlds: int
 ) -> dict[tuple[str, str], tuple[int, int, Callable[[], float]]]:
-    """Return agents, worlds and rate of each cavmarl side, stepped twice before measuring."""
+    """Return agents, worlds and a function that measures the rate, by sensors and side."""
     sides: dict[tuple[str, str], tuple[int, int, Callable[[], float]]] = {}
     for sensors, side, times, is_batched in OURS:
         count, together = times * agents, worlds if is_batched else 1

@@ -1,4 +1,5 @@
-"""Lock-step with other processes: the time master, followers, a reference stack, CARLA's clients.
+"""Co-simulation: a master advances the world's time, and other processes (followers) wait for it.
 
-Depends on `env`; `cli` starts both ends.
+Followers are driving stacks, ROS 2 nodes and CARLA's clients. Depends on `env`; `cli` starts worlds
+and followers.
 """

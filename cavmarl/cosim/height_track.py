@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cavmarl.sensors.kernels.vehicle_readings import GRAVITY_MPS2
 
 _DRIFT = (0.02, 0.3, 0.02)  # model error per square root of a second: m, m/s, rad
-_FIRST = (3.0, 1.0, 0.1)
+_FIRST = (3.0, 1.0, 0.1)  # initial standard deviations: m, m/s, rad
 
 
 @dataclass

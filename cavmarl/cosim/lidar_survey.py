@@ -48,11 +48,11 @@ class Survey:
     """The cloud of a survey, and the errors of its poses."""
 
     cloud: Cloud  # in the frame of the map
-    frames: int
-    drives: int
+    frames: int  # number of lidar frames in the cloud
+    drives: int  # number of trips of vehicles
     off_m: Points  # (n,) horizontal error of each frame's pose
-    off_height_m: Points
-    off_heading_rad: Points
+    off_height_m: Points  # (n,) signed error
+    off_heading_rad: Points  # (n,) signed error
 
 
 @dataclass

@@ -1,10 +1,10 @@
 """The board: a page of drivers whose recorded results were verified by repeating the evaluation.
 
-An entry is a folder NAME with a card (README.md), a closed evaluation of one driver (`result/`),
-and the driver: `model.safetensors`, `config.json` and the manifest of the training, or a script
-NAME.py, or a model file of another library, such as NAME.zip. Without these files, the driver is
-cavmarl's script of that name. Models of other libraries are not verified, because their arithmetic
-differs between processors and versions; they are shown as such.
+An entry is a folder NAME with a card (README.md), a finished evaluation of one driver (`result/`,
+with a closed manifest), and the driver: `model.safetensors`, `config.json` and the manifest of the
+training, or a script NAME.py, or a model file of another library, such as NAME.zip. Without these
+files, the driver is cavmarl's script of that name. Models of other libraries are not verified,
+because their arithmetic differs between processors and versions; they are shown as such.
 """
 
 from __future__ import annotations

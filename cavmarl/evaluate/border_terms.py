@@ -43,7 +43,7 @@ class BorderTerms:
         Args:
             places_m: (W, A, 2) positions of the agents before the step.
             acted: (W, A) which agents count.
-            terms: (W, A, T) terms of the step, registered ones last.
+            terms: (W, A, T) terms of the step; registered terms are last, and not summed.
         """
         if self._partition.count == 1 or not acted.any():
             return

@@ -120,7 +120,7 @@ class BackgroundUse:
             return
         for world in np.flatnonzero(running).tolist():
             rows = simulation.vehicles(world)
-            rows = rows[np.argsort(rows["id"])]  # sums are the same in each division
+            rows = rows[np.argsort(rows["id"])]  # sums do not depend on the zones
             vclass = simulation.types["vclass"][rows["vtype"]]
             counts = (rows["agent"] < 0) & self._has_engine[vclass]
             rows, vclass = rows[counts], vclass[counts]

@@ -60,7 +60,7 @@ class EpisodeJob(WorldSpec):
     """One run of some policies over the same episodes; the seed also seeds the policies."""
 
     policies: Mapping[str, str]  # as in `load_policy`, by name in the results
-    episodes: int  # number of episodes; episode e is the first one of world e of the seed
+    episodes: int  # number of episodes; episode e is the first episode of world e
     run: int = 0  # number of this run
     runs: int = 1  # number of runs
     record: RecordOptions | None = None  # options of recordings; None: no recording

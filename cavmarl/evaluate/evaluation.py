@@ -108,9 +108,9 @@ def evaluate(
 ) -> EvaluationReport:
     """Evaluate policies in `repeats` runs of `episodes` seeded episodes.
 
-    All policies drive the same episodes: episode e of a run is the first one of world e of its
-    seed. If the trained drivers among the policies need the same sensors, the worlds get these
-    sensors. Two or more runs are driven in new processes, one after the other.
+    All policies drive the same episodes: a run has one seed, and its episode e is the first episode
+    of world e. If the trained drivers among the policies need the same sensors, the worlds get
+    these sensors. Two or more runs are driven in new processes, one after the other.
 
     Args:
         env: as in `make_vec`, like all keywords that are not listed here.

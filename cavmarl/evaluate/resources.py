@@ -81,7 +81,7 @@ class ResourceWatch:
         self._rows += [(load.node, *window, *_reported(load, loads)) for load in loads]
 
     def _observed(self, pid: int, migrations: float = np.nan) -> tuple[float, ...]:
-        """Return processor time and memory of a process, and NaN for what is not observed."""
+        """Return the fields of RESOURCE from `cpu_s` on; NaN: not observed."""
         unknown = (*(np.nan,) * (len(RESOURCE.names or ()) - 8), migrations)
         try:
             process = psutil.Process(pid)

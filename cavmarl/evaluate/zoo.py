@@ -1,7 +1,8 @@
 """The zoo: trained drivers with results that can be verified by repeating the evaluation.
 
-An entry is the folder of a trained driver with a folder `result/`: a closed evaluation of `cavmarl
-evaluate`. To verify an entry, its evaluation is repeated and the bytes are compared.
+An entry is the folder of a trained driver with a folder `result/`: a finished evaluation of
+`cavmarl evaluate`, with a closed manifest. To verify an entry, its evaluation is repeated and the
+bytes are compared.
 """
 
 from __future__ import annotations
@@ -205,7 +206,7 @@ def cross(
     return Cross(tuple(policies), tables)
 
 
-# The world is compared by its map file; a changed map reader changes the trips instead.
+# Manifest keys of the map's source. If a new version reads the map differently, the trips differ.
 _WORLD_KEYS = ("environment", "map_source_sha256", "demand_content_sha256")
 _KEYS = ("agents", "background", "max_cycles", "seed", "overrides")
 

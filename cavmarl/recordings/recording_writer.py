@@ -118,7 +118,7 @@ class RecordingWriter:
         self._finish = weakref.finalize(self, self._sink.close)  # also runs when the process ends
 
     def add(self, frames: Iterable[WorldFrame], extras: Iterable[Extras] = ()) -> None:
-        """Add one frame per world; a tick that does not follow the last tick begins an episode.
+        """Add one frame per world; a tick at or below the world's last tick begins an episode.
 
         Args:
             frames: frames of worlds.

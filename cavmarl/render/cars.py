@@ -38,9 +38,9 @@ if TYPE_CHECKING:
 
 WALKER_M = 1.0  # shorter scripted road users are pedestrians
 MIN_RADIUS_PX = 4.5
-CORNERS = 12
+CORNERS = 12  # of the polygon of an oval
 DEPTH = 0.6  # depth of a pedestrian's shoulders, as a share of their width
-HEAD = 0.5
+HEAD = 0.5  # diameter of a pedestrian's head, as a share of the width of the shoulders
 RIM_PX = 1.0
 COLLIDED_PX = 2.5
 

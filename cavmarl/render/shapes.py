@@ -90,9 +90,9 @@ DASH_PERIOD_M = 9.0
 # A road that is higher than another one by this much is drawn over it.
 LEVEL_M = 4.0
 STOP_LINE_M = 0.7
-# A larger hull, as a multiple of the area of its paths, is land enclosed by roads.
+# A hull larger than this multiple of the area of its paths contains land, and is not filled.
 MAX_HULL_SHARE = 1.2
-MIN_HULL_M2 = 150.0  # smaller hulls are always filled
+MIN_HULL_M2 = 150.0  # added to that limit, so that smaller hulls are always filled
 # SUMO's link directions from left to right: left, half left, straight, half right, right. A U-turn
 # comes before them, or after them in left-hand traffic.
 DIRECTIONS_FROM_LEFT = "lLsRr"

@@ -68,12 +68,13 @@ class Window:
             self._window = None
 
 
-# A following camera: smallest visible extent, and share of its distance that it moves per picture.
+# A following camera: smallest visible extent, and the share of its distance to the followed
+# vehicles or place that it moves per picture.
 FOLLOW_M = 150.0
 FOLLOW_SHARE = 0.12
 MARGIN_PX = 50.0  # margin for the overlays in the corners
-STILL_DETAIL = 4
-MOVING_DETAIL = 2
+STILL_DETAIL = 4  # factor by which the ground is drawn larger, then reduced
+MOVING_DETAIL = 2  # the same while the camera follows vehicles
 
 
 class TopDownRenderer:
@@ -255,7 +256,7 @@ class TopDownRenderer:
 
 
 def _edge_ends(network: RoadNetwork, edges: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Return the ends of edges (…), (…, 2) m: the mean of their lanes' last points."""
+    """Return the end (…, 2) in m of each edge (…): the mean of its lanes' last points."""
     ends = np.zeros((*edges.shape, 2))
     for row, edge in np.ndenumerate(network.edges[edges]):
         first = edge["first_lane"]

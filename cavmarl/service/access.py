@@ -30,7 +30,7 @@ ALGORITHM = "EdDSA"
 ACCESS_S = 900.0
 REFRESH_S = 8 * 3600.0
 KEYS_KEPT = 2  # keys whose tokens are accepted: the current and the previous one
-MOST_VERIFIED = 10_000
+MOST_VERIFIED = 10_000  # tokens in the cache of checked signatures
 STATE_S = 3600.0  # validity of the signature of a state; exceeds any difference between clocks
 
 Admit = Callable[[str], None]
@@ -50,7 +50,7 @@ class Access:
     def add_identity(
         self, name: str, role: Role, actor: str = "service"
     ) -> tuple[IdentityRecord, str]:
-        """Create an identity and return its secret, which cannot be shown again."""
+        """Create an identity; return it and its secret, which cannot be shown again."""
         there = [one for one in self._log.state.identities.values() if one.name == name]
         if any(not one.revoked for one in there):
             raise problem("conflict", f"identity '{name}' exists already: choose another name")

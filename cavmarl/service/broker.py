@@ -239,8 +239,8 @@ class Broker:
     ) -> SessionRecord:
         """Open a session and assign it to a node.
 
-        A job for which no node is free waits at most `wait_s`. If `key` belongs to an earlier
-        request, return the session of that request.
+        A job for which no node is free waits at most `wait_s` (None: no limit). If `key` belongs to
+        an earlier request, return the session of that request.
 
         Raises:
             NoNodeError: no node can accept a session.

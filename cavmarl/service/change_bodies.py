@@ -101,6 +101,6 @@ class KeptRecording(_Change):
 class KeptSession(_Change):
     """The part of a session's saved state that is not the state of its worlds."""
 
-    begun_anew: list[bool]  # of each world: its web page restarted it after the last command
+    begun_anew: list[bool]  # by world: whether a web page restarted it after the last command
     scenario: SetScenario | None  # None: the scenario of the configuration
     recording: KeptRecording | None

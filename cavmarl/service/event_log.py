@@ -92,7 +92,7 @@ class EventLog:
     def _replayed(
         self, state: Infrastructure, after: int, digest: str, until: int | None = None
     ) -> Iterator[LogEvent]:
-        """Check and apply stored events, and return them."""
+        """Check and apply stored events, and yield each after it was applied."""
         for line in self.store.read_checked(after, digest, until):
             try:
                 state.apply(line)

@@ -43,7 +43,7 @@ from cavmarl.service.snapshots import SealedSnapshot
 
 SCHEMA = "cavmarl.service/2"
 _LOCK_KEY = 0x6361766D  # key of PostgreSQL's advisory lock
-_PAGE = 1000
+_PAGE = 1000  # lines that one query reads
 # PostgreSQL ends the connection, and so the lock, of a machine that does not answer for 4 s. The
 # service ends the connection to a machine of PostgreSQL that does not answer after the same time.
 _DEAD_PEERS = {

@@ -1,9 +1,9 @@
 """The HTTP interface of a node: worlds of sessions, opened with the tokens of their leases.
 
-A token names the session, its node and the node's incarnation. The service has signed it, so the
-node needs no other authority. The node saves a session's state with the service before it executes
-a command, never after it, so a saved state never includes a command whose answer may have been
-lost.
+A token names the session, its node and the node's incarnation, which is the number of times that
+the node has registered. The service has signed it, so the node needs no other authority. The node
+saves a session's state with the service before it executes a command, never after it, so a saved
+state never includes a command whose answer may have been lost.
 """
 
 from __future__ import annotations

@@ -44,6 +44,7 @@ class NodeLink:
         secret: secret of an identity with the role `node`.
         body: body of the registration; docs/guides/service.md lists its fields.
         is_supposed_idle: report no load, so that nodes are selected by their sessions alone.
+        options: further arguments of `AsyncClient`.
 
     Attributes:
         beats: number of heartbeats sent so far; the next one has this number.

@@ -50,7 +50,7 @@ class LiveNode:
     beat: int = -1  # sequence number of the last heartbeat
     use: Utilisation | None = None  # None: no heartbeat yet
     hosted: set[str] = field(default_factory=set)  # ids of the sessions assigned to the node
-    muted: set[str] = field(default_factory=set)  # sessions assigned since the last heartbeat
+    muted: set[str] = field(default_factory=set)  # hosted sessions that are not in `use` yet
     zones_of: list[str] = field(
         default_factory=list
     )  # sessions whose zones it hosts, once per part

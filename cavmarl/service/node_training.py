@@ -104,7 +104,7 @@ async def train(
 
 
 def run_files(run: Path) -> list[Path]:
-    """Return the files of a run in order of their names, without locks and drafts."""
+    """Return the files of a run sorted by name, without lock files and temporary files."""
     return sorted(one for one in run.iterdir() if one.is_file() and not one.name.startswith("."))
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from cavmarl.service.error_names import problem
 
-MOST_BUCKETS = 10_000
+MOST_BUCKETS = 10_000  # callers whose counts are kept
 
 
 class RateLimit:

@@ -24,7 +24,7 @@ Text = Annotated[str, StringConstraints(max_length=200)]
 Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 Port = Annotated[int, Field(ge=1, le=65535)]
 Whole = Annotated[int, Field(ge=0, lt=1 << 53)]  # JSON represents these integers exactly
-Seed = Annotated[int, Field(ge=0, lt=1 << SEED_BITS)]  # exact in Python's JSON; not in every reader
+Seed = Annotated[int, Field(ge=0, lt=1 << SEED_BITS)]  # some JSON parsers round it
 Words = Annotated[list[Word], Field(max_length=64)]
 
 

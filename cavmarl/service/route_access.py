@@ -23,7 +23,7 @@ from cavmarl.service.error_names import problem
 from cavmarl.service.rate_limit import RateLimit
 from cavmarl.service.service_records import ROLES, IdentityRecord
 
-MOST_HELD = 64
+MOST_HELD = 64  # open streams and waiting requests of one identity
 MOST_NESTED = 32  # arrays and objects of JSON inside each other
 _TEXT = re.compile(rb'"(?:[^"\\]|\\.)*"?', re.DOTALL)
 _NO_BRACKETS = bytes(byte for byte in range(256) if byte not in b"[]{}")

@@ -54,7 +54,7 @@ class NodeRecord:
 
 @dataclass
 class SessionRecord:
-    """A session of a client, or a job: an evaluation that a node runs without a client."""
+    """A session of a client, or a job: an evaluation or training that runs without a client."""
 
     id: str
     owner: str
@@ -68,15 +68,15 @@ class SessionRecord:
     state: SessionState = "queued"
     node: str | None = None
     incarnation: int = 0  # incarnation of `node`
-    placements: int = 0
+    placements: int = 0  # how often it was assigned to a node
     reason: str = ""  # why that node was chosen
     score: float = 0.0  # LoadScore of that node when it was chosen
     excluded: list[dict[str, Any]] = field(
         default_factory=list
     )  # some excluded nodes, with reasons
-    excluded_count: int = 0
+    excluded_count: int = 0  # number of all excluded nodes
     saved_number: int = 0  # commands that the saved state includes
-    saved_blob: str | None = None
+    saved_blob: str | None = None  # hash of the saved state
     results: dict[str, str] = field(default_factory=dict)  # name → hash
     message: str = ""
     key: str = ""  # key that identifies a repeated request
@@ -138,11 +138,11 @@ class Infrastructure:
     )  # jobs without a node, in order of arrival
     # hash of content → number of configurations, artefacts, states and results that refer to it
     users: Counter[str] = field(default_factory=Counter)
-    # content without users that `take_unused` has not returned yet
+    # content without references that `take_unused` has not returned yet
     unused: set[str] = field(default_factory=set, compare=False)
 
     def take_unused(self) -> set[str]:
-        """Return the content that has lost its last user since the last call."""
+        """Return the content that has lost its last reference since the last call."""
         found, self.unused = self.unused, set()
         return found
 

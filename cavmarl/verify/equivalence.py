@@ -36,7 +36,7 @@ class ZoneResult:
 
     zones: int  # number of zones
     steps: int  # number of compared steps
-    crossings: int  # number of changes of zone from step to step, in all worlds
+    crossings: int  # vehicles that changed their zone, summed over steps and worlds
     vehicles: float  # number of vehicles in all worlds, averaged over the steps
     world: int | None  # the first world that differs; None if all were equal
     difference: Difference | None  # the difference in this world; None if all were equal

@@ -29,7 +29,7 @@ class RepeatedRun:
     """The result of `repeat_recording`."""
 
     environment: str
-    episodes: int
+    episodes: int  # number of repeated episodes
     steps: int  # number of repeated steps
     state_hash: str  # hash of the state at the end
     # first step (from 0 over all episodes) whose state differs, and its tick; None: all are equal

@@ -3,9 +3,10 @@ r"""Expressions that name numbers in the JSON of a command.
 An expression is a path, such as `rows[side=libsumo].median`. A step is a key, an index, `{any key}`
 or `*` for all elements; `[key=value,…]` chooses an element of a list, with braces around a value
 with commas. `100 max rows.*.share` applies operations from right to left: a factor,
-`min`, `max`, `mean`, `median`, `sum`, `len`, or `first` to `fourth`. A text gives the numbers that
-it contains. `PATH / PATH` is a ratio; `PATH ; PATH` gives the first number of each path. A metric
-of an evaluation gives its mean and the ends of its interval, in the unit of the reports.
+`min`, `max`, `mean`, `median`, `sum`, `len`, or `first` to `fourth` (elements of a list). A text
+gives the numbers that it contains. `PATH / PATH` is a ratio; `PATH ; PATH` gives the first number
+of each path. A metric of an evaluation gives its mean and the ends of its interval, in the unit of
+the reports.
 """
 
 from __future__ import annotations

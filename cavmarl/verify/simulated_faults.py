@@ -18,13 +18,13 @@ from cavmarl.verify.simulated_machine import (
 )
 
 SKEW_S = 1e6  # limit of the offset of a clock
-CLOCK_RATES = (0.8, 1.25)
+CLOCK_RATES = (0.8, 1.25)  # limits of the rate of a clock, s per simulated s
 JUMP_S = 0.3  # longest jump of a clock
 
 NODE_KINDS = (FrameKind.REPORT, FrameKind.MESSAGES, FrameKind.SHARE, FrameKind.KEEP)
 RECOVERY_KINDS = (FrameKind.SYNC, FrameKind.REPORT, FrameKind.GIVE, FrameKind.MISSED)
 CALLER_KINDS = (FrameKind.COMMAND, FrameKind.RECOVER)
-LATER_FRAMES = 4  # a process dies at one of this many next frames of a kind
+LATER_FRAMES = 4  # a process dies in one of its next frames of a kind; largest number of these
 
 
 class Fault(StrEnum):

@@ -47,12 +47,12 @@ ROSTER_ROW = np.dtype(
 )
 ROW_BYTES = 9
 MARGIN_M = 1000.0
-MOST = 2**24 - 1
-HEADINGS = 2048
+MOST = 2**24 - 1  # largest coordinate, cm
+HEADINGS = 2048  # headings in a full turn
 SPEEDS_PER_MPS = 4.0
 BRAKING_MPS2 = -0.8  # brake lights are on at or below this
 REBASE_ROWS = 1000  # the whole roster is sent after twice the vehicles plus this many changes
-REBASE_CHANGES = 256
+REBASE_CHANGES = 256  # it is also sent after this many messages of changes
 
 
 class Change(NamedTuple):

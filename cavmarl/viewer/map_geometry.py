@@ -66,8 +66,8 @@ def map_message(network: RoadNetwork) -> bytes:
 
     Sections: `roads` and `lines` (PIECE), `surfaces` and `buildings` (CORNER, three per triangle),
     `stop_lines` (STOP_LINE), `phase_states` (uint8 positions in `SIGNAL_STATES`) and `phase_first`
-    (uint32). A signal shows `phase_states[phase_first[phase] + letter]`, unless the frame has a
-    state of the caller for the link of the stop line (`stop_links`, uint32).
+    (uint32). A signal shows `phase_states[phase_first[phase] + letter]`, unless the frame
+    has a state that a program has set for the link of the stop line (`stop_links`, uint32).
     """
     shapes = road_shapes(network)
     origin = map_origin(network)

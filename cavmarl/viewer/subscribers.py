@@ -37,7 +37,7 @@ class PageWatcher:
     news: asyncio.Event = field(default_factory=asyncio.Event)
     vehicle: int | None = None  # id of the watched vehicle
     sensors: bool = False  # whether to include its sensors
-    ghosts_of: int | None = None
+    ghosts_of: int | None = None  # zone whose ghosts are marked
     is_lost: bool = False  # whether the page reads too slowly
 
     def offer(self, publication: Publication) -> None:
@@ -71,7 +71,7 @@ class Wishes:
     watchers: int = 0
     vehicles: frozenset[int] = frozenset()
     sensed: frozenset[int] = frozenset()  # vehicles whose sensors are included
-    ghosts_of: tuple[int, ...] = ()
+    ghosts_of: tuple[int, ...] = ()  # zones whose ghosts are marked
 
 
 class Audience:

@@ -37,7 +37,7 @@ class ActorOrder:
         moved_by: `poses`, `controls`, or `nothing`: it does not move.
         rate_hz: rate of its poses; 0: unknown.
         extrapolation_s: largest time for which a pose is extrapolated.
-        rig: names of the sensors of the world that it carries.
+        rig: names of the sensors that it carries; the world's key `rig` defines them.
     """
 
     name: str

@@ -40,11 +40,12 @@ class PoseCounts:
     """Counts of the poses of a track."""
 
     received: int = 0
-    # poses that arrived after a newer pose (dropped), or over a period and a step late (used)
+    # poses that arrived after a newer pose and were dropped, or that were used but more than one
+    # period (1 / `rate_hz`) plus one step old on arrival
     late: int = 0
     lost: int = 0  # poses missing between two poses at the given rate
     extrapolated: int = 0  # steps without a pose for the end of the step
-    stopped: int = 0  # steps in which the newest pose was older than the bound
+    stopped: int = 0  # steps in which the newest pose was older than `extrapolation_s`
     worst_age_s: float = 0.0  # largest age of the newest pose at the end of a step
 
     def to_dict(self) -> dict[str, float]:
@@ -63,7 +64,7 @@ class PoseTrack:
         counts: late, lost and extrapolated poses.
 
     Raises:
-        ActionError: the rate or the bound is out of range.
+        ActionError: `rate_hz` or `extrapolation_s` is out of range.
     """
 
     def __init__(self, rate_hz: float, extrapolation_s: float) -> None:

@@ -28,9 +28,9 @@ CAMERA_RANGE_M = 300.0
 _DEPTH_RANGE_M = 1000.0  # depth of pixels without an object
 _DEPTH_STEPS = (1 << 24) - 1
 _FACES_OF_PRISM = 6
-_MAX_PIXELS = 4096
+_MAX_PIXELS = 4096  # on each side of a picture
 _MAX_POINTS = 10_000_000
-_ROAD_TAG, _BUILDING_TAG = 1, 3
+_ROAD_TAG, _BUILDING_TAG = 1, 3  # CARLA's semantic tags
 _TAGS = {NOTHING: 11, GROUND: 10, ROAD: _ROAD_TAG, LANE_LINE: 24, BUILDING: _BUILDING_TAG}
 
 TAGS = np.zeros(NUM_SEMANTICS, np.uint8)  # CARLA's tag of each class
@@ -52,9 +52,9 @@ class _Spin:
         self._angle = 0.0
 
     def next(self, elapsed_s: float) -> tuple[float, list[tuple[float, float, int]]]:
-        """Return the angle at the start and the parts of a scan.
+        """Return the angle at the start and the parts of a scan, in rad, clockwise.
 
-        A part is the azimuth of its first column, the step, and the number of columns, clockwise.
+        A part is the azimuth of its first column, the angle between columns, and their number.
         """
         started = self._angle
         columns = round(self._points_per_s * elapsed_s / self.channels)
@@ -308,7 +308,7 @@ class AttachedCamera:
         raise NotImplementedError
 
     def bodies(self, context: SensorContext) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-        """Return which pixels (H, W) show vehicles or walkers, and the ids (n,) of their rows."""
+        """Return which pixels (H, W) show vehicles or walkers, and the vehicle id (n,) of each."""
         surroundings = context.surroundings
         prisms = surroundings.panorama.prisms
         body = (self.lens.picture_of(surroundings).face - FIRST_FACE) // _FACES_OF_PRISM

@@ -272,7 +272,7 @@ class SensorSuite:
                 yield mounted.stream, mounted.actor, mounted.sensor.kind, body
 
     def sense(self) -> Iterator[tuple[int, CarlaActor, int, bytes]]:
-        """Yield stream, actor, kind and body of each frame that is due and wanted."""
+        """Yield stream, actor, kind and body of each frame that is due and has a listener."""
         session = self._context.session
         for mounted in list(self._mounted.values()):
             now_s = session.time_s

@@ -20,7 +20,7 @@ from cavmarl.cosim.carla.call_table import CALLS, Caller, Returns, call
 from cavmarl.cosim.carla.carla_session import CarlaSession
 
 MAX_COMMANDS = 1 << 14
-_SPAWN, _DESTROY, _LIGHTS, _CONSOLE = 0, 1, 18, 20
+_SPAWN, _DESTROY, _LIGHTS, _CONSOLE = 0, 1, 18, 20  # CARLA's numbers of commands
 _CALL_OF_COMMAND = {
     2: "apply_control_to_vehicle",
     3: "apply_ackermann_control_to_vehicle",
@@ -81,7 +81,7 @@ def _answer(caller: Caller, session: CarlaSession, index: int, body: list[Any]) 
 def _carry_out(
     caller: Caller, session: CarlaSession, index: int, body: list[Any], spawned: int = 0
 ) -> int:
-    """Carry out a command; return its actor. `spawned`: the actor that 0 stands for."""
+    """Carry out a command; return its actor. `spawned`: the actor that replaces the number 0."""
     if index == _SPAWN:
         if spawned:
             raise CallRefused("a spawn command after a spawn command")

@@ -74,6 +74,7 @@ class CarlaActor:
     """One actor.
 
     Attributes:
+        number: CARLA's id of the actor; `parent`: that of its parent, or 0.
         attributes: values by name; kinds as in the blueprint.
         pose: the current pose; for vehicles and walkers, see `ActorTable.pose_of`.
         local: pose relative to the parent.
@@ -124,8 +125,8 @@ class ActorTable:
     """The actors of one episode, and their states as records of a snapshot.
 
     `first_number`: number of the first actor, larger than all numbers of earlier episodes, because
-    clients remember actors by their numbers. `next_number`: smallest number of the first vehicle.
-    `known`: actors of vehicles that may appear, by the ids of the vehicles.
+    clients remember actors by their numbers. `next_number`: lower bound of the numbers of vehicles.
+    `known`: actors, by vehicle id, that keep their numbers when these vehicles appear.
     """
 
     def __init__(

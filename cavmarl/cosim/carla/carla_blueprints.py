@@ -281,7 +281,7 @@ _PROPS = {
     "warningconstruction": (0.4, 0.8, 0.9),
     "wateringcan": (0.4, 0.2, 0.3),
 }
-_CHILDREN = (9, 10, 11, 12, 13, 14, 48, 49)
+_CHILDREN = (9, 10, 11, 12, 13, 14, 48, 49)  # numbers of walkers
 # Programs look these up, but cavmarl's server refuses to spawn them.
 _OTHER_CAMERAS = (
     "camera.normals",
@@ -371,7 +371,7 @@ BLUEPRINTS = {
     )
 }
 
-# The blueprint of vehicles of the world, by the class that cameras see.
+# The blueprint of vehicles that no client has spawned, by their class in semantic pictures.
 BLUEPRINT_OF_CLASS = {
     CAR: "vehicle.tesla.model3",
     TRUCK: "vehicle.carlamotors.carlacola",

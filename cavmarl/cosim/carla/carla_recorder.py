@@ -140,7 +140,7 @@ class CarlaRecorder:
     """Records the world of a session after each tick.
 
     `folder`: folder of the recordings; None: recordings are refused. `most_rows`: a recording ends
-    with this number of vehicles, summed over its ticks.
+    when it has this number of rows, one per vehicle and tick.
     """
 
     def __init__(self, folder: Path | None, most_rows: int) -> None:

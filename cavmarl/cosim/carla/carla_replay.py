@@ -87,7 +87,7 @@ class CarlaRecording:
         return (moment for moment, _ in self._moments())
 
     def collisions(self) -> Iterator[tuple[float, int, WorldFrame]]:
-        """Yield time and id of each vehicle that has collided, and the last frame that has it."""
+        """Yield time and id of each vehicle that has collided, and the last frame with it."""
         hits: dict[tuple[int, int], list[int]] = {}
         for episode, event in self._recording.events():
             if event.kind == "collision":

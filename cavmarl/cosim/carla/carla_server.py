@@ -1,8 +1,8 @@
 """`CarlaServer`: the ports to which CARLA's clients connect, and the loop that runs the world.
 
 One thread answers all calls and advances the world, so only one thread uses the time master. In
-synchronous mode a client's cue advances the world; otherwise the wall clock does. The protocol has
-no login: by default, only programs of this machine can connect.
+synchronous mode, the call `tick` of a client advances the world; otherwise the wall clock does. The
+protocol has no login: by default, only programs of this machine can connect.
 """
 
 from __future__ import annotations

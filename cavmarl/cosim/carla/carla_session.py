@@ -33,7 +33,7 @@ log = logging.getLogger("cavmarl.carla")
 
 _SAME_S = 1e-6  # step lengths that differ by less are equal
 _NOWHERE = CarlaPose(0.0, 0.0, 0.0)
-_WEATHER = [0.0] * 12 + [0.0331, 0.0]
+_WEATHER = [0.0] * 12 + [0.0331, 0.0]  # the fields of CARLA's `WeatherParameters`, in order
 
 
 @dataclass(frozen=True)

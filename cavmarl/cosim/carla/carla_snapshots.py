@@ -18,7 +18,7 @@ from cavmarl.cosim.carla.carla_geometry import CarlaPose
 
 _FRAME_HEAD = struct.Struct("<QQd6f")
 _SNAPSHOT_HEAD = struct.Struct("<Qdf3iI")
-_MAP_CHANGED = 1
+_MAP_CHANGED = 1  # bit of the flags of a snapshot
 ACTIVE = 1  # state of an actor
 
 _STATE_BYTES = 119

@@ -139,7 +139,7 @@ class _Questions:
         distances_m: lengths of the paths from there to `ends`.
         ends: poses after junctions.
         insides: poses in the middle of the paths of junctions in which paths cross.
-        junctions: the junction of each of these.
+        junctions: the junction of each of `insides`.
         before_lights: poses before traffic lights, one for each lane.
     """
 

@@ -9,7 +9,7 @@ Questions:
     places: a list of `[x, y, z]`.
     paths: a list of `[[x, y, z], distances_m]`.
     light_type: type of the signals that are traffic lights.
-    ahead_m: how far ahead of `before_lights`, a list of `[x, y, z]`, a traffic light may be.
+    before_lights, ahead_m: a list of `[x, y, z]`, and the distance within which lights ahead count.
 
 Answers:
     nearest: for each place, the pose of the nearest lane for cars there, or None.

@@ -34,10 +34,10 @@ from cavmarl.cosim.carla.carla_session import CarlaSession, EpisodeSettings
 from cavmarl.cosim.carla.carla_streams import EPISODE_STREAM
 from cavmarl.cosim.carla.hosted_world import GENERATED_MAP
 
-_ROAD_TAG = 1
+_ROAD_TAG = 1  # CARLA's semantic tag
 _MAX_MANAGERS = 256
 _MAX_PORT = 65535
-_SHORTEST_S, _LONGEST_S = 0.001, 10.0
+_SHORTEST_S, _LONGEST_S = 0.001, 10.0  # limits of `fixed_delta_seconds`
 
 _settings = record_of(flag, flag, optional(number), *[anything] * 8, required=3)
 _weather = record_of(*[number] * 14, required=12)

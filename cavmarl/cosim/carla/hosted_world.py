@@ -127,7 +127,7 @@ class HostedWorld:
     @property
     def present_lanes(self) -> NDArray[np.void]:
         """LANE (L,) as they are now, with limits that roadside units and callers have set."""
-        # The last table belongs to the only world, or to the map if lanes never change.
+        # The last table is the copy of the only world or, if lanes cannot change, that of the map.
         lanes: NDArray[np.void] = self.simulation.shards[0].worlds.lanes[-1]
         return lanes
 
@@ -221,7 +221,7 @@ class WorldSource(Protocol):
 
 
 class GivenWorld:
-    """The source of a server for an environment of its caller: this one world.
+    """The source of a server that has one world: the environment that the caller has made.
 
     `path`: the map file of the environment.
     """

@@ -1,6 +1,6 @@
 """The navigation mesh of walkers: where the client's walkers may walk.
 
-The roads of the engine have no sidewalks. The mesh therefore has a strip along the outer side of
+The roads of cavmarl have no sidewalks. The mesh therefore has a strip along the outer side of
 each road, a corner between two strips at a junction, and a crosswalk before each junction. The
 client reads the mesh with Detour, as one tile. Detour's frame is (x, z, y) of the client's frame.
 """
@@ -57,7 +57,8 @@ _DETAIL = np.dtype(
         ("padding", "u1", 2),
     ]
 )
-# Two triangles of a quadrangle: three of its corners each, then flags of edges on its border.
+# A quadrangle as two triangles, four bytes each: three of its corners, and flags of the edges that
+# are edges of the quadrangle.
 _TRIANGLES = bytes((0, 1, 2, 1 | 4, 0, 2, 3, 4 | 16))
 
 
@@ -147,7 +148,7 @@ def _beside(
 def _connections(
     network: RoadNetwork, strips: dict[int, _Strip], points: NDArray[np.float64], side: float
 ) -> Iterator[tuple[tuple[int, ...], tuple[int, int]]]:
-    """Yield corners between strips and crosswalks between both sides of a road."""
+    """Yield corners between strips and crosswalks over roads: four vertices, area and flags."""
     edges = network.edges
     leaving: dict[int, list[int]] = {}
     neighbours: dict[int, set[int]] = {}

@@ -238,7 +238,7 @@ def _kind_of(actor: RecordedActor) -> str:
 
 
 def _matcher(letter: int) -> Callable[[RecordedActor], bool]:
-    """Return whether actors are of the kind of a letter: h, v, w, t, o or a."""
+    """Return a function that tests the kind of an actor; `letter`: a key of `_LETTERS`."""
     wanted = _LETTERS.get(chr(letter) if 0 <= letter < 128 else "")
     if wanted is None:
         raise CallRefused(

@@ -38,7 +38,7 @@ class RayHits(NamedTuple):
     hits: NDArray[np.void]  # HIT (A, E)
     rays: NDArray[np.float64]  # (A, E, 3) directions in the frame of the carrier
     mount: NDArray[np.float64]  # (3, 4) of the sensor on its carrier
-    carrier: CarlaPose
+    carrier: CarlaPose  # pose of the carrier
 
 
 class Surroundings:

@@ -76,7 +76,7 @@ class SensorContext:
         return parent.vehicle if (apart <= parent.half_m[:2]).all() else -1
 
     def numbers_of(self, vehicles: NDArray[np.int64]) -> NDArray[np.uint32]:
-        """Return the actors' numbers of vehicles' ids; 0 for ids without an actor."""
+        """Return the actor number (n,) of each vehicle id (n,); 0: no actor."""
         ids, places = np.unique(vehicles, return_inverse=True)
         actors = [self.session.actors.of_vehicle(one) for one in ids.tolist()]
         numbers = [0 if actor is None else actor.number for actor in actors]
@@ -84,14 +84,14 @@ class SensorContext:
         return found
 
     def tagged(self, tags: NDArray[np.uint8], vehicles: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Return tags (n,) of vehicles' ids, with `PROP_TAG` for props."""
+        """Return tags (n,) of vehicles (n,), with props' tags replaced by `PROP_TAG`."""
         props = self.session.actors.props
         if not props.size:
             return tags
         return np.where(np.isin(vehicles, props), np.uint8(PROP_TAG), tags)
 
     def velocities_of(self, vehicles: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return velocities (n, 3) of vehicles' ids; zero for ids without an actor."""
+        """Return the velocity (n, 3) in m/s of each vehicle id (n,); zero: no actor."""
         ids, places = np.unique(vehicles, return_inverse=True)
         speeds = np.zeros((len(ids), 3))
         for row, vehicle in enumerate(ids.tolist()):

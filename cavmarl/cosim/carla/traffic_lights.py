@@ -37,10 +37,10 @@ class _Group:
     """The phase of a signal that clients time. Phases are numbered from the first of a program."""
 
     first: int  # PHASE row
-    following: list[int]
+    following: list[int]  # next phase of each phase
     durations_s: NDArray[np.float64]  # duration of each phase
-    phase: int
-    elapsed_s: float
+    phase: int  # current phase
+    elapsed_s: float  # time in the current phase
     is_frozen: bool = False
 
     def advance(self, step_s: float) -> bool:
@@ -100,11 +100,11 @@ class TrafficLights:
         return self._map.states_in(self._env.simulation.signal_phases(0))
 
     def set_state(self, light: int, state: int) -> None:
-        """Show a state at a light for its time of that state; OFF: until another call.
+        """Show a state at a light for its time of that state; OFF or time 0: until another call.
 
         Raises:
             CallRefused: there is no such state.
-            ConfigError: the world has too little room for states of the caller.
+            ConfigError: `signals.overrides` is less than the number of links with signals.
         """
         self._check_room()
         if state not in _CODE_OF_STATE:

@@ -16,7 +16,7 @@ THROTTLE_MPS2 = 4.5  # acceleration at throttle = 1
 BRAKE_MPS2 = 8.0  # deceleration at brake = 1
 _ROLLING_MPS2 = 0.2  # deceleration without throttle, and its increase per m/s
 _DRAG_PER_S = 0.02
-_LARGEST_SINE = 0.99
+_LARGEST_SINE = 0.99  # of the slip angle
 _STANDING_MPS = 0.01
 _ACKERMANN_PER_S = 2.0  # acceleration per m/s of difference to the target speed
 

@@ -1,9 +1,9 @@
 """`FollowedWorld`: a world whose time a master advances and whose agents followers drive.
 
-The cycle is Algorithm 1 of the co-simulation paper: the queued controls take effect, the
-world ticks, sensors deliver the frame of t + Δt, each follower computes u from it, and u is queued
-for the next cycle. The cycle ends when every follower has answered. So a slow follower delays the
-world, and no frame is skipped.
+The cycle is Algorithm 1 of the co-simulation paper (docs/explanation/papers.md): the queued
+controls take effect, the world ticks, sensors deliver the frame of t + Δt, each follower computes
+controls u from it, and u is queued for the next cycle. The cycle ends when every follower has
+answered. So a slow follower delays the world, and no frame is skipped.
 
 Followers are served in the order of their first agent; followers without agents come last, sorted
 by name. Answers may arrive in any order without effect on the result.
@@ -238,7 +238,7 @@ class FollowedWorld:
             Path(self.address).unlink(missing_ok=True)
 
     def admit(self, within_s: float) -> None:
-        """Seat followers that have introduced themselves; wait up to `within_s` for the first."""
+        """Add followers that have sent HELLO; wait up to `within_s` for the first one."""
         for line, hello in self._reception.callers(within_s):
             try:
                 self._seat(line, hello)

@@ -32,9 +32,9 @@ _ADAPTERS: dict[type, TypeAdapter[Any]] = {}  # cached, as they are slow to cons
 _CLOSED = ConfigDict(extra="forbid")
 
 VERSION = 4
-MAX_LETTER = 1 << 22
-MAX_DATA = 1 << 28
-MAX_VEHICLES = 4096
+MAX_LETTER = 1 << 22  # bytes of a payload
+MAX_DATA = 1 << 28  # bytes of the arrays of one message
+MAX_VEHICLES = 4096  # vehicles that one follower may request
 MAX_POSES = 4096  # maximum number for one actor in a message
 
 
@@ -126,8 +126,8 @@ class Welcome:
     # ticks by which the vehicle delays controls after the start of their step
     control_latency_ticks: StrictInt
     action: StrictStr  # `continuous`, `discrete` or `grid`
-    acceleration_mps2: StrictFloat  # acceleration for the first control at 1
-    steering_rad: StrictFloat  # steering angle for the second control at 1
+    acceleration_mps2: StrictFloat  # acceleration if the first control is 1
+    steering_rad: StrictFloat  # steering angle if the second control is 1
     # sensors of every vehicle; empty: snapshots contain the `observation` of the environment
     sensors: list[SensorView]
 
@@ -226,7 +226,7 @@ class Control:
     # by vehicle or actor. Vehicles: two numbers in [-1, 1], or the number of a meta-action. Actors
     # that are moved by controls: two numbers in [-1, 1]; the last controls are kept until new ones
     controls: dict[StrictStr, list[StrictFloat] | StrictInt]
-    poses: dict[StrictStr, list[PoseView]] = field(default_factory=dict)  # as in `Poses`
+    poses: dict[StrictStr, list[PoseView]] = field(default_factory=dict)  # as in `ActorPoses`
 
 
 @with_config(_CLOSED)

@@ -17,8 +17,8 @@ from cavmarl.core.errors import ConfigError, RosError, require
 from cavmarl.cosim.ros2.ros_types import RosTypes
 
 MAX_DOMAIN = 101  # higher domains need ports that Linux gives to other programs
-_MAX_PARTICIPANTS = 32
-_KEPT_SAMPLES = 10
+_MAX_PARTICIPANTS = 32  # programs that share a domain on this machine
+_KEPT_SAMPLES = 10  # messages of a topic that wait until they are read
 # Types with large messages (some MB), which arrive one by one. Several messages of other types may
 # arrive at once, and a node that is busy for a second must not lose them.
 LARGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2")

@@ -50,7 +50,7 @@ class RosOptions:
         profile: topics and frames; see `ros_topics.VehicleTopics`.
         distro: distribution whose types are used.
         domain: ROS_DOMAIN_ID.
-        wait: `stamp`: each step waits for a command with the time of the step, minus the lag.
+        wait: `stamp`: each step waits for a command of its time, minus `lag_steps` steps.
             `newest`: a step takes the newest command and never waits, so results depend on the wall
             clock.
         deadline_s: a step waits at most this long, wall time; then the last command is held.

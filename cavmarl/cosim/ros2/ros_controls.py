@@ -78,7 +78,7 @@ class ControlCounts:
     used: int = 0  # steps with a command for their time
     held: int = 0  # steps with an older command, or without any (the vehicle brakes)
     late: int = 0  # steps in which no command arrived before the deadline
-    old: int = 0  # messages older than a used message
+    old: int = 0  # messages older than the newest one before them
     invalid: int = 0  # messages with NaN, infinity, or bytes that are not a message
     limited: int = 0  # steps in which a command was beyond the limits of the vehicle
 

@@ -42,8 +42,8 @@ class _Camera(NamedTuple):
     """A camera: its pose on the vehicle, and its focal length in pixels."""
 
     sensor: StackSensor
-    turn: NDArray[np.float64]
-    place_m: NDArray[np.float64]
+    turn: NDArray[np.float64]  # (3, 3)
+    place_m: NDArray[np.float64]  # (3,) in the vehicle's frame
     focal_px: float
 
 

@@ -1,13 +1,13 @@
 """Localisation by GNSS, IMU and odometry: an extended Kalman filter of x, y, heading and speed.
 
-The bias of the fixes, east and north, is part of the state. This class assumes that it is 0,
-because GNSS alone cannot separate it from the position.
+The bias of the fixes, east and north, is part of the state. `GnssInertial` assumes that it is
+0, because GNSS alone cannot separate it from the position.
 
 The model is that of Thrun, Burgard, Fox: "Probabilistic Robotics", 2005, chapter 3.3, with the
 kinematic bicycle's slip angle: the centre moves at heading + asin(r L / 2 v) where r is the yaw
-rate and L the length between the axles. The first fix gives the position. The heading is the
-direction of the lane there, reversed if the fixes move the other way. If a sensor detects lane
-markings, they give the distance from the centre of the lane.
+rate and L the wheelbase, here the vehicle's length. The first fix gives the position. The heading
+is the direction of the lane there, reversed if the fixes move the other way. If a sensor detects
+lane markings, they give the distance from the centre of the lane.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _FIRST_HEADING_RAD = 0.3
 _LANE_SEARCH_M = 8.0
 _LANE_MATCH_M = 4.0
 _LANE_SURE_M = 0.6  # deviation of the position below which neighbouring lanes can be distinguished
-_GATE = 9.0  # squared deviations beyond which a measurement of lanes is rejected
+_GATE = 9.0  # squared Mahalanobis distance beyond which lane measurements are rejected
 _COURSE_M = 8.0  # distance driven before the course of the fixes is compared with the heading
 _STRAIGHT_RAD = 0.5
 _SIZE = 6  # x, y, heading, speed, bias of the fixes east and north
@@ -253,7 +253,7 @@ class GnssInertial:
         """Update the state by one number; return whether it was accepted.
 
         `row`: derivatives of the number by the first numbers of the state. `surprise`: the number
-        minus its expected value. `gate`: squared deviations beyond which it is rejected.
+        minus its expected value. `gate`: limit of its squared Mahalanobis distance.
         """
         row = np.concatenate([row, np.zeros(_SIZE - len(row))])
         spread = float(row @ self._spread @ row) + deviation**2

@@ -24,10 +24,10 @@ _GAP_M = 0.8
 _ROAD_M = 2.5  # maximum distance of an echo from the centre of a lane
 _BESIDE_ROAD_M = 6.0  # the same for pedestrians, who may step onto the road
 _MATCH_M = 3.0  # maximum distance between an object and its predicted position
-_SAME_M = 0.5  # the same for an object that keeps the kind of an earlier detection: 0.1 s before
-_ALPHA, _BETA = 0.5, 0.2
-_FORGET_S = 0.5
-_STILL_MPS = 0.6
+_SAME_M = 0.5  # the same, if the object is to keep the kind of an earlier detection
+_ALPHA, _BETA = 0.5, 0.2  # gains of the alpha-beta filter
+_FORGET_S = 0.5  # an object that is not detected for this time is forgotten
+_STILL_MPS = 0.6  # slower objects are reported as stopped
 _FEW = 3  # detections before a velocity is used
 
 
@@ -39,8 +39,8 @@ class _Track:
     y_m: float
     vx_mps: float
     vy_mps: float
-    seen_s: float
-    times: int
+    seen_s: float  # time of the last detection
+    times: int  # number of detections
     kind: str
 
 

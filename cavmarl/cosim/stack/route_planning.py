@@ -32,17 +32,17 @@ _AHEAD_M = 70.0
 _MATCH_M = 5.0
 _HEADING_COST_M = 3.0  # lateral distance from a lane that counts like a radian of heading
 _EXPECTED_M = 1.5  # preference for a lane on the previous route
-_ACCEL, _DECEL, _HEADWAY_S, _GAP_M = 1.5, 2.5, 1.4, 2.0
-_HARDEST = 6.0
+_ACCEL, _DECEL, _HEADWAY_S, _GAP_M = 1.5, 2.5, 1.4, 2.0  # of the IDM; accelerations in m/s²
+_HARDEST = 6.0  # maximum braking, m/s²
 _BESIDE_M = 0.3  # lateral distance kept to an obstacle beside the route
 _BESIDE_WALKER_M = 0.8  # the same for a pedestrian
 _WALK_S = 3.0  # time for which a pedestrian's walk is extrapolated
 _BEND_MPS2 = 2.0  # maximum lateral acceleration
-_BRAKE_FOR_YELLOW = 3.0
+_BRAKE_FOR_YELLOW = 3.0  # stop at yellow if less braking than this suffices, m/s²
 # Yield to a vehicle with the right of way within this time or distance of its line.
 _CLEAR_S = 4.0
 _CLEAR_M = 12.0
-_CHANGE_BEHIND_M, _CHANGE_AHEAD_M = 10.0, 6.0
+_CHANGE_BEHIND_M, _CHANGE_AHEAD_M = 10.0, 6.0  # free distances for a lane change at equal speeds
 _SIGHT_M = 50.0  # distance from which a line is considered
 _STANDS_MPS = 0.7
 
@@ -124,7 +124,7 @@ class LaneRoute:
     def _way(
         self, here: OnLane, plan: NDArray[np.void]
     ) -> tuple[list[int], list[float], NDArray[np.float64], float | None]:
-        """Return the lanes ahead, their starts, their points, and the end of the route."""
+        """Return the lanes ahead, their starts (m), the route's points, and where to wait (m)."""
         lanes, starts = [here.lane], [-here.s_m]
         pieces = [self._map.polyline(here.lane, here.s_m)]
         reached = float(self._network.lanes["length_m"][here.lane]) - here.s_m
@@ -132,7 +132,7 @@ class LaneRoute:
         while reached < _AHEAD_M:
             following = int(plan["next"][lanes[-1]])
             if plan["change"][lanes[-1]] != 0 or following < 0:
-                # If a lane has to be left, its end is a place to wait.
+                # If a lane change is needed, the end of the lane is the place to wait for it.
                 ends = reached if plan["change"][lanes[-1]] != 0 else None
                 break
             lanes.append(following)
@@ -306,7 +306,7 @@ def _bends(points: NDArray[np.float64]) -> list[tuple[float, float]]:
 def _beside(
     points: NDArray[np.float64], x_m: float, y_m: float
 ) -> tuple[float, float, float, float]:
-    """Return s and d of a place relative to a route, and the route's direction there."""
+    """Return s and d of a place relative to a route, and cos and sin of the route's heading."""
     steps = np.diff(points, axis=0)
     lengths = np.hypot(steps[:, 0], steps[:, 1])
     units = steps / lengths[:, None]

@@ -2,7 +2,8 @@
 
 Between scans, the filter of `localisation` uses GNSS, IMU and odometry. Each scan is aligned with
 the map's upright surfaces by generalized ICP (small_gicp), starting from the filter's pose. The
-matched pose updates the filter with the information of the pairs' normals. Along an endless street
+result is a set of pairs: an echo and its nearest wall point. The pose updates the filter with the
+information matrix of the wall normals of the pairs. Along an endless street
 this information is zero, and only GNSS gives the position.
 
 Fixes have a bias of some metres, which the filter learns from the scans. While the position is
@@ -36,10 +37,10 @@ _LOWEST_M, _HIGHEST_M = 0.3, 4.0  # heights above the road that exclude ground a
 _UPRIGHT = 0.5  # maximum vertical part of a wall's normal
 _AROUND_M = 60.0  # extent of the map around a scan
 _EXTRUDED_M = (-0.2, 0.0, 0.2)  # copies of a single-layer scan, as for upright walls
-_GATE = 16.0  # squared deviations from the filter's pose beyond which a match is rejected
-_GATE_M = 1.5  # pairs farther apart are other objects
+_GATE = 16.0  # squared Mahalanobis distance from the filter's pose beyond which a match is rejected
+_GATE_M = 1.5  # the echo of a pair farther apart belongs to an object that the map lacks
 _PAIR_M = 0.4  # pairs nearer than this are used for the pose
-_FEWEST_PAIRS, _LEAST_SHARE = 30, 0.5
+_FEWEST_PAIRS, _LEAST_SHARE = 30, 0.5  # least number of used pairs, and share of all pairs
 _DEVIATION_M = 0.08  # standard deviation of a pair, for map and scan
 _CORRELATED = 9.0  # this many pairs count as one, since neighbouring errors are correlated
 _WEAKEST = 1e-3  # share of the best axis's information below which an axis is ignored
@@ -135,7 +136,7 @@ class ScanMatching(GnssInertial):
         return True
 
     def _apart(self, pose: Points) -> float:
-        """Return the squared deviations of x, y and heading (3,) from the filter's pose."""
+        """Return the squared Mahalanobis distance of (x, y, heading) from the filter's pose."""
         off = pose - self._get()[:3]
         off[2] = wrap_angle(float(off[2]))
         spread = self._spread[:3, :3] + np.diag([_PAIR_M, _PAIR_M, _PAIR_M / _TURN_M]) ** 2

@@ -63,7 +63,7 @@ class Obstacle(NamedTuple):
     heading_rad: float  # direction of its longer axis, along the road
     length_m: float
     width_m: float
-    vx_mps: float
+    vx_mps: float  # velocity in the map's frame; 0: unknown, or stopped
     vy_mps: float
     kind: str = "unknown"  # or `vehicle`, `cyclist`, `pedestrian`, if a camera detects it
 
@@ -92,7 +92,7 @@ class Trajectory:
     accel_mps2: float  # acceleration along the route now
     # reason of the acceleration: `free`, `gap`, `pedestrian`, `stop_line`, `yield` or `end`
     reason: str = "free"
-    lanes: Sequence[int] = field(default_factory=tuple)
+    lanes: Sequence[int] = field(default_factory=tuple)  # LANE rows of the route
 
 
 class Perception(Protocol):

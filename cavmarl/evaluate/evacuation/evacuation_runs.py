@@ -25,7 +25,7 @@ from cavmarl.roads.network import RoadNetwork
 STEP_S = 1.0
 TICK_S = 0.1
 STANDING_MPS = 0.5
-SHARES = (0.5, 0.9, 1.0)
+SHARES = (0.5, 0.9, 1.0)  # shares of an area's vehicles, for the clearance times
 RECOVERED_SHARE = 1.1  # stopped vehicles after recovery / before the closure, at most
 ENTRY, DEMAND = "env.yaml", "demand.rou.xml"
 Told = Callable[[int, int], None]
@@ -50,9 +50,9 @@ class AreaResult:
     departed: int
     arrived: int
     unserved: int  # vehicles that have not reached an exit, including those unable to depart
-    clearance_50_s: float | None
-    clearance_90_s: float | None
-    clearance_s: float | None
+    clearance_50_s: float | None  # time at which half of the vehicles have reached an exit
+    clearance_90_s: float | None  # the same for 90 % of the vehicles
+    clearance_s: float | None  # the same for all vehicles
     last_arrival_s: float | None  # last arrival at an exit
     mean_trip_s: float | None  # from the planned departure to the exit
     left_by_s: float | None  # time at which the last vehicle was seen on a road of the area
@@ -67,13 +67,13 @@ class EvacuationResult:
     all: AreaResult
     exits: dict[str, int]  # arrivals at each exit
     longest_queue: int  # largest number of vehicles stopped at the same time
-    mean_queue: float
+    mean_queue: float  # mean number of stopped vehicles over the samples
     queues: dict[str, int]  # longest queues: largest number of stopped vehicles by road
     # time in s from the last opening of a road until the number of stopped vehicles is about as
     # low as before the first closure; None: no closure ended, or traffic did not recover
     recovery_s: float | None
-    deadlocks: tuple[tuple[int, ...], ...]  # deadlocks at the end
-    rerouted: int
+    deadlocks: tuple[tuple[int, ...], ...]  # ids of vehicles that wait for each other at the end
+    rerouted: int  # changes of route; one vehicle may count several times
     contacts: int  # number of vehicles that began to touch another vehicle
     # roads and junctions with most contacts → vehicles in contact, summed over the samples
     contact_places: dict[str, int]

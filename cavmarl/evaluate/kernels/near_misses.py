@@ -55,11 +55,11 @@ def _place_on_link(roads: RoadArrays, row: np.void) -> tuple[int, float]:
 
 @kernel
 def _stay(conflict: np.void, row: np.void, centre_m: float, dt: float) -> tuple[float, float]:
-    """Return the times from now, in s, between which a vehicle covers an area, else (-1, -1).
+    """Return for how many s a vehicle has covered an area, and will cover it; else (-1, -1).
 
-    The vehicle is assumed to keep its present speed. Times are clipped to the step, because other
-    steps cover the rest. Only if the centre has just passed the stop line may the front have
-    entered the area earlier.
+    The vehicle is assumed to keep its present speed. Times are limited to the step, because other
+    steps cover the rest. The first time is not limited in the step in which the centre passes the
+    stop line: in earlier steps, the front may have entered the area without being recorded.
     """
     half = 0.5 * row["length"]
     ahead = centre_m + half - conflict["enter_m"]

@@ -22,7 +22,7 @@ Numbers = NDArray[np.float64]
 YEAR = 2024
 ROLLOUTS = 32
 _SMOOTHING = 0.1  # added to each bin
-_EVENT_SMOOTHING = 0.001
+_EVENT_SMOOTHING = 0.001  # added to the counts of rollouts with and without the event
 
 
 class MetricComponent(NamedTuple):
@@ -114,7 +114,7 @@ def _derivatives_valid(valid: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDA
 
 
 def _log_likelihoods(component: MetricComponent, values: Numbers, samples: Numbers) -> Numbers:
-    """Return (E, T) the log-likelihoods of values (E, T), given samples (E, R, T); NaN: missing."""
+    """Return (E, T) log-likelihoods of values (E, T), by samples (E, R, T) of R rollouts."""
     low, high, bins = component.low, component.high, component.bins
     edges = np.linspace(low, high, bins + 1)
     found = np.full(values.shape, np.nan)
@@ -145,7 +145,7 @@ def _mean_likelihood(name: str, likelihoods: Numbers, valid: NDArray[np.bool_]) 
 def _event_likelihood(
     name: str, log: RolloutFeatures, rollouts: Sequence[RolloutFeatures], first: int
 ) -> float:
-    """Return the likelihood of whether objects collided, or left the road, while logged."""
+    """Return the likelihood, by rollouts, that each object has or lacks the event as in the log."""
     kind = "collided" if name == "collision_indication" else "off_road"
     seen = log.valid[:, first:]
     happened = (getattr(log, kind)[:, first:] & seen).any(axis=1)

@@ -46,7 +46,7 @@ class Trajectories:
 
 @dataclass(frozen=True)
 class RolloutFeatures:
-    """Features (E, T) of the first E objects. They have a value where `valid` is true.
+    """Features (E, T) of the first E objects, in m, s and rad; valid where `valid` is true.
 
     Derivatives are central differences: NaN at the first and the last time, accelerations also
     beside them.

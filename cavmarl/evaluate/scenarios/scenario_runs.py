@@ -102,8 +102,8 @@ def make_scenario(
         place: place on the map; empty: drawn by the seed, which also seeds the first reset.
         density: density of the other traffic, one of `DENSITIES`.
         zones: number of zones; None: as configured by the environment.
-        keys: keys of the world; the first of the agents (default 1) is in the conflict, the others
-            follow it.
+        keys: keys of the world; `agents` is 1 by default. The first agent is in the conflict, the
+            others follow it.
 
     Raises:
         ConfigError: no such scenario, no place for it on the map, no room for the agents, or a

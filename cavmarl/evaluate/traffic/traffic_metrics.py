@@ -117,7 +117,9 @@ class TouchCounter:
 
 
 def headways_s(rows: NDArray[np.void]) -> NDArray[np.float64]:
-    """Return the time headways of the vehicles that follow another one on their lane, in s.
+    """Return the time headways, in s, of vehicles behind another one on their lane.
+
+    Vehicles slower than `FOLLOWS_MPS`, and headways above `LONGEST_HEADWAY_S`, are left out.
 
     Args:
         rows: VEHICLE (n,) with lane, s, speed and length.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import ConfigError, require
 from cavmarl.evaluate.traffic.traffic_comparison import TrafficComparison
 
-LEAST_EDGE_M = 50.0  # on a shorter edge, one vehicle would be the density of a jam
+LEAST_EDGE_M = 50.0  # on a shorter edge, one vehicle gives a density like that of a jam
 BIN_PER_KM = 10.0  # width of the bins whose means a line joins
 LEAST_IN_BIN = 5
 COLORS = {"SUMO": "#d1793b", "cavmarl": "#2f6db5"}

@@ -21,7 +21,7 @@ class _Scenario(NamedTuple):
     begin_s: int = 0
 
 
-_MORNING, _AFTERNOON = 25_200, 57_600
+_MORNING, _AFTERNOON = 25_200, 57_600  # begin of the demand, s after midnight
 _SCENARIOS = {
     "grid4x4": _Scenario("grid4x4_1.rou.xml"),
     "arterial4x4": _Scenario("arterial4x4_1.rou.xml"),

@@ -133,7 +133,7 @@ class SignalWorld:
     Attributes:
         table: the signals with two or more greens.
         counts: (N, COUNTS) of the lanes of `table`; see `signals.kernels.lane_counts`.
-        simulation: the vehicles and signals of the world, as number 0.
+        simulation: the simulation, whose only world (index 0) is this one.
         network: the map, with the programs that run.
 
     Raises:

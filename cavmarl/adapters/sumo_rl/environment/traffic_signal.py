@@ -189,7 +189,7 @@ class TrafficSignal:
         return spaces.Box(-np.inf, np.inf, (self.reward_dim,), np.float32)
 
     def choice(self, action: Any) -> int:
-        """Return the green that an action begins, if the current green may end.
+        """Return the green of an action, or the next one if it would exceed `max_green`.
 
         Raises:
             ActionError: the action is not the index of a green.
