@@ -52,7 +52,7 @@ class BrokerRules:
     idle_s: float = 600.0  # idle time after which a session ends
     keep_s: float = 3600.0  # how long ended sessions can be read
     keep_nodes_s: float = 86_400.0  # how long nodes that are down or have left are kept
-    max_placements: int = 10  # nodes that a job may lose before it fails
+    max_losses: int = 10  # nodes that a job may lose before it fails, without a new saved state
     max_skew_s: float = 5.0  # tolerated difference of the clocks of a node and of the service
     max_nodes: int = 10_000
     max_sessions: int = 1000  # open sessions of one identity
@@ -217,7 +217,7 @@ class Broker:
             elif session.job is None and idle_s > self.rules.idle_s:
                 self._tell(session, "timeout", {"of": "idle session", "after_s": idle_s})
                 self._end(session, "closed", "service", f"no request for {idle_s:.0f} s")
-        self.jobs.end_hopeless(self.rules.max_placements)
+        self.jobs.end_hopeless(self.rules.max_losses)
         self._reports.watch_own_clock(now_s)
         self.zone_nodes.sweep()
         self.artefacts.sweep()

@@ -82,12 +82,12 @@ class JobQueue:
                 self.note(session, error)
                 self.has_failed()
 
-    def end_hopeless(self, max_placements: int) -> None:
+    def end_hopeless(self, max_losses: int) -> None:
         """End jobs whose waiting time is over, or that have lost several nodes."""
         for number in list(self._log.state.waiting):
             session = self._log.state.sessions[number]
-            if session.placements >= max_placements:
-                self._end(session, f"{session.placements} nodes were lost with it")
+            if session.losses >= max_losses:
+                self._end(session, f"{session.losses} nodes were lost with it")
                 continue
             waited_s = self._log.wall_s() - session.opened_s
             if session.wait_s is None or session.placements or waited_s <= session.wait_s:

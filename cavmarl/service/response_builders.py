@@ -110,7 +110,7 @@ def node_answer(service: Service, node: NodeRecord) -> response_bodies.NodeStatu
 def session_answer(service: Service, session: SessionRecord) -> response_bodies.Session:
     """Return a session or a job, without the fields that only its node needs."""
     found = asdict(session)
-    del found["saved_blob"], found["owners"]
+    del found["saved_blob"], found["owners"], found["losses"]
     live = service.broker.live.get(session.node or "")
     progress = None if live is None else live.jobs.get(session.id)
     waits_for = service.broker.jobs.reason_of(session)

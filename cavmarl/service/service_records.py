@@ -69,6 +69,7 @@ class SessionRecord:
     node: str | None = None
     incarnation: int = 0  # incarnation of `node`
     placements: int = 0  # how often it was assigned to a node
+    losses: int = 0  # nodes that were lost or left with it since its state was last saved
     reason: str = ""  # why that node was chosen
     score: float = 0.0  # LoadScore of that node when it was chosen
     excluded: list[dict[str, Any]] = field(
@@ -242,6 +243,7 @@ class Infrastructure:
         for session in self.sessions.values():
             if session.node == name and session.state == "active":
                 session.node, session.state = None, "queued"
+                session.losses += 1
                 if session.job is not None:
                     self.waiting[session.id] = None
 
@@ -271,7 +273,7 @@ class Infrastructure:
                 session.placements += 1
             case "saved":
                 self._replace_user(event.data["sha256"], session.saved_blob)
-                session.saved_number = event.data["number"]
+                session.saved_number, session.losses = event.data["number"], 0
                 session.saved_blob = event.data["sha256"]
             case "repartitioned":
                 session.members = event.data["members"]

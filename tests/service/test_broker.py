@@ -465,6 +465,22 @@ def test_a_job_fails_after_ten_nodes_were_lost_with_it(fleet: Fleet) -> None:
     assert (job.state, job.message) == ("failed", "10 nodes were lost with it")
 
 
+def test_a_training_that_stores_states_may_lose_more_than_ten_nodes(fleet: Fleet) -> None:
+    job = fleet.open(job={"settings": {}})
+    for k in range(12):
+        fleet.join(f"n{k}")
+        if k == 5:
+            fleet.broker.save(job, 1, b"state")
+        fleet.broker.leave(fleet.nodes, f"n{k}")
+    fleet.broker.sweep()
+    assert (job.state, job.placements) == ("queued", 12)
+    for k in range(12, 15):
+        fleet.join(f"n{k}")
+        fleet.broker.leave(fleet.nodes, f"n{k}")
+    fleet.broker.sweep()
+    assert (job.state, job.message) == ("failed", "10 nodes were lost with it")
+
+
 def test_nodes_that_have_left_are_deleted_after_a_day(fleet: Fleet) -> None:
     fleet.join("a", "b")
     session = fleet.open(zone_nodes=2)

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError, MessageError
-from cavmarl.v2x.kernels.v2x_records import KIND_CAM
+from cavmarl.v2x.kernels.v2x_records import KIND_CAM, KIND_SPAT
 from cavmarl.v2x.v2x_messages import RECEPTION, Exchange, messages_of
 from tests.v2x.station_worlds import StationWorld
 
@@ -80,19 +80,21 @@ def test_the_simulator_has_the_tick_of_the_world_and_delays_packets() -> None:
     assert statistics.mean_latency_s == pytest.approx(0.1 * (2 * 3 + 3 * 4) / 22)
 
 
+class ReceiveAll:
+    """A fake network simulator that delivers each packet at once to the two agents."""
+
+    def __init__(self, turn: int = 1) -> None:
+        self.turn = turn
+
+    def exchange(self, sent: Exchange) -> NDArray[np.void]:
+        pairs = [(sent.tick, n, r) for n in range(len(sent.packets)) for r in range(2)]
+        return np.array(pairs[:: self.turn], dtype=RECEPTION)
+
+
 def test_results_do_not_depend_on_the_order_of_receptions() -> None:
     said = []
     for turn in (1, -1):
         world = StationWorld(2, inbox__objects=1, **EXTERNAL)
-
-        class ReceiveAll:
-            def __init__(self, turn: int) -> None:
-                self.turn = turn
-
-            def exchange(self, sent: Exchange) -> NDArray[np.void]:
-                pairs = [(sent.tick, n, r) for n in range(len(sent.packets)) for r in range(2)]
-                return np.array(pairs[:: self.turn], dtype=RECEPTION)
-
         world.bus.connect(ReceiveAll(turn))
         world.put(PLACES)
         for _ in range(3):
@@ -100,6 +102,18 @@ def test_results_do_not_depend_on_the_order_of_receptions() -> None:
         said.append(world.bus.mail.objects.tobytes())
         assert world.bus.mail.objects[0, 0, 0]["sender"] == 1
     assert said[0] == said[1]
+
+
+def test_a_vehicle_receives_the_phase_of_the_signal_whose_row_equals_its_id() -> None:
+    units = {"roadside__signals": ["all"], "roadside__rate_hz": 10.0, "inbox__signals": 16}
+    world = StationWorld(2, **units, **EXTERNAL)
+    world.bus.connect(ReceiveAll())
+    world.put(PLACES)
+    world.tick()
+    assert len(world.simulation.network.signals) == 16
+    for agent in range(2):
+        told = messages_of(KIND_SPAT, world.bus.mail.signals[0, agent])["signal"]
+        assert sorted(told.tolist()) == list(range(16))
 
 
 @pytest.mark.parametrize(

@@ -57,6 +57,7 @@ class _World:
         self.movers: list[tuple[int, int]] = []
         self.births: list[Birth] = []
         self.answered: set[tuple[int, int]] = set()
+        self.refused: set[tuple[int, int]] = set()  # part of `answered`
         self.has_stepped = False  # whether each zone has received a STEP in the current episode
         self.has_begun = False  # whether the first reset is done; before, rows have no episode
         self.on_record = OwnersOnRecord(zones, limits) if is_checked else None
@@ -161,6 +162,7 @@ class NodeCoordinator:
                 world.write(world.directory.host(zone, worker=node_of[zone]))
             world.births, world.movers = [], []
             world.answered.clear()
+            world.refused.clear()
             world.has_stepped = False
         self._node_of, self.switched, self.is_late = node_of, switched, False
         self._has_recovered = True
@@ -245,7 +247,10 @@ class NodeCoordinator:
         table = world.directory.table
         is_present = message.episode == table.episode and message.tick >= table.tick
         if isinstance(message, Ack | Nack) and is_present:
-            world.answered.update((entry.vehicle, message.zone) for entry in message.entries)
+            pairs = {(entry.vehicle, message.zone) for entry in message.entries}
+            world.answered |= pairs
+            if isinstance(message, Nack):
+                world.refused |= pairs
         output = world.directory.on_message(message)
         world.write(output)
         if output.messages:
@@ -378,6 +383,7 @@ class NodeCoordinator:
         for w, world in enumerate(self.worlds):
             births, world.births = world.births, []
             world.answered.clear()
+            world.refused.clear()
             if world.is_silent(births) and world.directory.begin_quiet():
                 continue
             output = world.directory.begin(world.movers, births)
@@ -397,7 +403,7 @@ class NodeCoordinator:
         owners = world.directory.table.owners
         return [
             TransferInFlight(vehicle, owners[vehicle][0], zone, "prepared")
-            for vehicle, zone in sorted(world.answered)
+            for vehicle, zone in sorted(world.answered - world.refused)
             if vehicle in owners and owners[vehicle][0] != zone
         ]
 

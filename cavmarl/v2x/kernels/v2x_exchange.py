@@ -259,7 +259,8 @@ def receive_packet(
     num = _expire_and_sort(box, tick, scratch.squared, me["x"], me["y"])
     for k in range(packet["first"], packet["first"] + packet["count"]):
         report = mail.reports[w, slot, k]
-        if report["subject"] == me["id"] or report["expires"] < tick:
+        is_own = packet["kind"] != KIND_SPAT and report["subject"] == me["id"]
+        if is_own or report["expires"] < tick:
             continue
         place = find(box, num, report["subject"])
         if place < 0:
