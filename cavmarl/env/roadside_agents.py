@@ -180,7 +180,7 @@ class RoadsideAgents(ABC):
 
         `decides`: whether its next action counts. `action_mask`: allowed choices, int8. `refused`:
         number of choices in the episode that were not allowed. The index of the present choice
-        has the key `self.choice`; each term of the reward has its own key.
+        has the key in the attribute `choice`; each term of the reward has its own key.
         """
         arrays = self._arrays
         decides = int(arrays.signal_decides[0])
