@@ -36,6 +36,7 @@ from cavmarl.ownership.messages import (
 from cavmarl.ownership.trace import TraceEntry
 
 Holding = tuple[int, int, int, int, bytes]
+"""(zone, incarnation, vehicle, epoch, digest) of a state at a host."""
 
 
 class KnownOwners(Protocol):
@@ -62,8 +63,6 @@ class KnownOwners(Protocol):
     @property
     def tallies(self) -> Mapping[Any, Any]: ...
 
-
-"""`Holding`: (zone, incarnation, vehicle, epoch, digest) of a state at a host."""
 
 Owner = tuple[int, int]
 """(zone, epoch) of a vehicle."""

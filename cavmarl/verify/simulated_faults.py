@@ -76,7 +76,7 @@ TOLERATED_RATES: Mapping[Fault, float] = {
 SEVERE_RATES: Mapping[Fault, float] = dict.fromkeys(SEVERE, 3e-4) | dict.fromkeys(
     NODE_DEATHS, 1.5e-3
 )
-# Severe faults drawn by rate are some seconds apart, so that worlds recover from most of them.
+# Severe faults drawn by rate are up to a second apart, so that worlds recover from most of them.
 # Tolerated faults are short, so that even many of them stay below the time limits.
 SEVERE_APART_S = (0.0, 1.0)
 SHORT_DELAY_S = 0.01
