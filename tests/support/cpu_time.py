@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 LISTED_AT_END_S = 2.0  # tests above this time are listed at the end of a run
-ARGUED_S = 2.0  # tests above this time are slow, unless argued.txt lists them
+ARGUED_S = 1.0  # tests above this time are slow, unless argued.txt lists them
 LISTED_S = 0.5  # tests below this time are not in costs.txt
 OFTEN_S = 0.5  # time for the variants of a test in every run; the cheapest variant always runs
 TURNS = 30  # turns of `make rotation` in which each slow test runs once, except long tests
