@@ -18,10 +18,9 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from cavmarl.config.terms import TERMS
 from cavmarl.core.errors import TrainingError
+from cavmarl.evaluate.provenance.training_record import CSV_FILE
 from cavmarl.learning.checkpoint import Parts, writing
 from cavmarl.learning.loggers import BOARD_FILES, make_loggers
-
-CSV_FILE = "progress.csv"
 
 WINDOW = 1000  # number of last trips that a row averages
 

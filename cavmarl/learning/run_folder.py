@@ -23,6 +23,7 @@ from cavmarl.engine.world_setup import World
 from cavmarl.evaluate.provenance.manifest import MANIFEST_FILE
 from cavmarl.evaluate.provenance.training_record import (
     CHECKPOINT_FILE,
+    CSV_FILE,
     begin_training,
     end_training,
     is_trained,
@@ -38,7 +39,7 @@ from cavmarl.learning.checkpoint import (
     writing,
 )
 from cavmarl.learning.data_parallel import ALONE, Ranks
-from cavmarl.learning.log import CSV_FILE, Log, cut_logs
+from cavmarl.learning.log import Log, cut_logs
 from cavmarl.learning.loggers import logger_names
 from cavmarl.learning.options import given_options, settings_of
 from cavmarl.networks.background_driver import background_drivers

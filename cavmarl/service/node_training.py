@@ -21,7 +21,7 @@ from cavmarl.client.service_protocol import plain_name
 from cavmarl.config.registry import programs
 from cavmarl.core.errors import ServiceError, TrainingError
 from cavmarl.core.processes import start_dying_with_process
-from cavmarl.evaluate.provenance.training_record import CHECKPOINT_FILE, is_trained
+from cavmarl.evaluate.provenance.training_record import CHECKPOINT_FILE, CSV_FILE, is_trained
 from cavmarl.service.error_names import problem
 from cavmarl.service.node_link import NodeLink, until_answered
 from cavmarl.service.training_settings import PROGRAM, RUN, program_options
@@ -29,7 +29,7 @@ from cavmarl.service.training_settings import PROGRAM, RUN, program_options
 POLL_S = 0.5  # time between two looks at the program
 STORE_S = 5.0  # shortest time between two states that the service stores
 MOST_RUN_BYTES = 1 << 29  # of the files of a run
-CURVE_FILE = "progress.csv"
+ROW_BYTES = 1 << 14  # of the largest row of a learning curve
 
 
 async def train(
@@ -150,11 +150,17 @@ def _stamp(run: Path) -> tuple[int, int]:
 def _decisions(run: Path) -> int:
     """Return the number of decisions in the last complete row of the learning curve."""
     try:
-        lines = (run / CURVE_FILE).read_text(encoding="utf-8").splitlines(keepends=True)
+        with (run / CSV_FILE).open("rb") as file:
+            head = file.readline()
+            size = file.seek(0, io.SEEK_END)
+            file.seek(max(len(head), size - 2 * ROW_BYTES))  # the curve of a long run is large
+            rows = [row for row in file.readlines() if row.endswith(b"\n")]
     except FileNotFoundError:
         return 0
-    rows = list(csv.DictReader(line for line in lines if line.endswith("\n")))
-    return int(float(rows[-1]["agent_steps"])) if rows else 0
+    if not rows:
+        return 0
+    (row,) = csv.DictReader([head.decode(), rows[-1].decode()])
+    return int(float(row["agent_steps"]))
 
 
 def _message_of(messages: Path) -> str:

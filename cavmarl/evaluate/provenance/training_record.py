@@ -23,6 +23,7 @@ from cavmarl.evaluate.provenance.manifest import (
     read_closed,
 )
 
+CSV_FILE = "progress.csv"  # the learning curve, a row for each update
 CHECKPOINT_FILE = "checkpoint.pt"  # from which a run resumes; see `learning.checkpoint`
 
 
