@@ -30,7 +30,8 @@ def assign(problem: Problem) -> tuple[Placement, str]:
     and the time of the moves. An excluded worker keeps its shards until balancing moves them.
 
     Raises:
-        NoAdmissibleWorkerError: shards need a place, and all (in a row: any) workers are excluded.
+        NoAdmissibleWorkerError: shards need a place, and all workers are excluded; with
+            `problem.in_row`, also if any worker is excluded.
     """
     workers, rejections = workers_of(problem)
     if problem.present is None:
@@ -48,7 +49,7 @@ def assign(problem: Problem) -> tuple[Placement, str]:
 
 
 def _place(problem: Problem, workers: Workers) -> tuple[Placement, str]:
-    """Of placements about as fast as `longest`, return the one with fewest separated neighbours."""
+    """Return a placement that is about as fast as `longest` and separates the fewest neighbours."""
     shards = range(len(problem.shards))
     nowhere = Placement(problem, workers, [-1 for _ in shards])
     if problem.in_row:

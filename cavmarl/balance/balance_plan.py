@@ -123,7 +123,8 @@ def make_plan(problem: Problem) -> Plan:
     """Place the shards; equal problems give equal plans on every machine.
 
     Raises:
-        NoAdmissibleWorkerError: shards need a place, and all (in a row: any) workers are excluded.
+        NoAdmissibleWorkerError: shards need a place, and all workers are excluded; with
+            `problem.in_row`, also if any worker is excluded.
     """
     placement, method = assign(problem)
     numbers = placement.workers.numbers

@@ -19,7 +19,8 @@ class Balancer:
         plan: the current plan; reproducible from its own problem.
 
     Raises:
-        NoAdmissibleWorkerError: all workers are excluded (in a row: any).
+        NoAdmissibleWorkerError: all workers are excluded; with `Problem.in_row`, also if any worker
+            is excluded.
     """
 
     def __init__(
@@ -54,7 +55,8 @@ class Balancer:
         """Make the next plan: place lost shards, and move a few other shards if that saves time.
 
         Raises:
-            NoAdmissibleWorkerError: a worker is lost, and all (in a row: any) others are excluded.
+            NoAdmissibleWorkerError: a worker is lost, and all other workers are excluded; with
+                `Problem.in_row`, also if any of them is excluded.
             ConfigError: there are more workers than shards, or a cost is invalid.
         """
         before = self.plan

@@ -1,4 +1,7 @@
-"""Placement of shards in a row: each worker hosts one piece, and the ends of pieces move."""
+"""Placement of consecutive shards: each worker hosts one piece of the list of shards.
+
+Later rounds of balancing move the ends of pieces.
+"""
 
 from __future__ import annotations
 
@@ -16,12 +19,12 @@ from cavmarl.core.errors import NoAdmissibleWorkerError
 def divide_row(
     placement: Placement,  # changed and returned
 ) -> Placement:
-    """Cut the row into one piece per worker, sized by its speed, with at least one shard."""
+    """Cut the list of shards into one piece per worker, sized by its speed; no piece is empty."""
     problem, workers = placement.problem, placement.workers
     if not workers.is_open.all():
         rejections = find_rejections(problem.snapshot.workers, problem.rule.load)
         raise NoAdmissibleWorkerError(
-            f"{'; '.join(map(str, rejections))}: in a row each worker hosts at least one shard; "
+            f"{'; '.join(map(str, rejections))}: each worker must host at least one shard; "
             "use fewer workers, or wait until they are less busy",
             rejections,
         )

@@ -1,4 +1,4 @@
-"""Places shards that have no worker yet: the longest first, or in a row."""
+"""Places shards that have no worker yet: the costliest first, or as runs of consecutive shards."""
 
 from __future__ import annotations
 
@@ -43,11 +43,12 @@ def assign_longest_first(
 def divide_chain(
     placement: Placement,  # changed and returned
 ) -> Placement:
-    """Divide the row of all shards, by world and zone, into one piece per worker.
+    """Divide the list of all shards into at most one piece of consecutive shards per worker.
 
-    Consecutive zones of a bisection are neighbours, so pieces are connected. The division has the
-    minimum makespan: the limit is found by bisection, and each worker takes as many shards as fit
-    into the limit (chains on chains; Pinar and Aykanat, J. Parallel Distrib. Comput. 64, 2004).
+    The list is sorted by world and zone. Consecutive zones of a bisection are neighbours, so pieces
+    are connected. The division has the minimum makespan: the limit is found by bisection, and each
+    worker takes as many shards as fit into the limit (chains on chains; Pinar and Aykanat, J.
+    Parallel Distrib. Comput. 64, 2004).
     """
     low, high = 0.0, _longest_s(placement)
     homes = _within(placement, high)

@@ -26,7 +26,9 @@ from cavmarl.service.service_records import ArtefactRecord
 _PLAIN = re.compile(r"[A-Za-z0-9_+:#,() -]{0,64}")
 _INSTALLED_MAP = re.compile(r"sumo:[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*(\.[A-Za-z0-9_-]+)+")
 YAML = ".yaml"  # the only files that the service reads itself
-MOST_YAML_BYTES = 1 << 18  # all YAML files of a configuration; reading 64 KiB takes a second
+# All YAML files of a configuration, 256 KiB. The limit is low because reading YAML is slow: about
+# one second per 64 KiB.
+MOST_YAML_BYTES = 1 << 18
 MOST_FILES_BYTES = 1 << 30  # all files of a configuration, which a node keeps for each session
 _RESERVED = ("agents", "configs", "envs", "runs")  # folders of installed entries and of runs
 _OF_OTHERS = ("zones.journal", "zones.simulators", "workers.key_file")
@@ -74,7 +76,11 @@ def check_files(environment: str, files: Mapping[str, str]) -> None:
     for place in files:
         top = place.split("/")[0]
         if top in _RESERVED and top != place:
-            raise problem("refused", f"files: {place}: the folder {top} must have another name")
+            raise problem(
+                "refused",
+                f"files: {place}: the folder name {top} is reserved, like all of "
+                f"{', '.join(_RESERVED)}: rename the folder",
+            )
         if top != DRIVER_FOLDER and not is_environment:
             raise problem(
                 "refused", f"files: {place} belongs to no environment: add {ENVIRONMENT_FILE}"

@@ -154,7 +154,8 @@ def _chosen(
     others = [name for name in greens if name not in chosen]
     if not chosen:
         raise ConfigError(
-            "signals.agents = 'all': no signal of this map has two or more greens; use none"
+            f"signals.agents = 'all': no signal of this map has 2 to {MAX_GREENS} greens; "
+            "set signals.agents to 'none'"
         )
     if others:
         _tell_once(network.source_hash, network.name, len(others), ", ".join(others[:5]))

@@ -155,7 +155,7 @@ def test_the_error_for_a_missing_map_names_the_map(source: str) -> None:
 
 
 @pytest.mark.parametrize("source", ["sumo:tools/game/nowhere.net.xml", "sumo:../pip/__init__.py"])
-def test_the_error_for_a_map_that_sumos_wheel_does_not_have_names_the_map(source: str) -> None:
+def test_the_error_names_a_map_that_is_missing_from_sumos_wheel(source: str) -> None:
     pytest.importorskip("sumo")
     config, base_dir = load_config("town", overrides={"map.source": source})
     with pytest.raises(MapError, match=r"map\.source = 'sumo:"):

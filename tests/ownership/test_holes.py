@@ -1,7 +1,9 @@
-"""The holes H1 to H28 of the protocol in the paper: none of these faults can occur.
+"""Tests of the holes H1 to H28: none of these faults can occur.
 
-H21 (pairs across a border), H24 (content of a state) and H27 (load readings) are outside of the
-core, which transfers states as bytes. The test of H24 checks that the bytes do not change.
+A hole is a case that the protocol of paper A leaves open; see "Departures from the paper" in
+docs/explanation/ownership.md. H21 (pairs across a border), H24 (content of a state) and H27 (load
+readings) are outside of `cavmarl/ownership`, which transfers states as bytes. The test of H24
+checks that the bytes do not change.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""The core uses only the standard library, without input, output, clocks, threads or randomness."""
+"""`cavmarl/ownership` uses only the standard library.
+
+It uses no input, output, clocks, threads or randomness.
+"""
 
 from __future__ import annotations
 

@@ -143,7 +143,10 @@ WAY = ("way per infraction", distance_per_infraction)
 
 
 def shares(*names: str, decimals: int = 1, **titles: str) -> Rows:
-    """Return a row for each share; `titles` replace titles made from the names."""
+    """Return a row for each share.
+
+    The title of a row is the name of the share with spaces for `_`, unless `titles` has another.
+    """
     return [
         (titles.get(name, name.replace("_", " ")), share(name, decimals=decimals)) for name in names
     ]
@@ -255,7 +258,7 @@ def messages_table(results: Results) -> str:
         for title, report in reports.items()
     ]
     paired = (difference(name, reports["none"], reports["all"]) for name in names)
-    lines.append(("none lost minus all lost", *paired))
+    lines.append(("difference: no message lost - all lost", *paired))
     return table(("messages lost", *names.values()), lines, is_right=True)
 
 
@@ -287,7 +290,7 @@ def ring_page(results: Results) -> str:
         "idm": "`idm`",
         "gentle": "`gentle`, which speeds up by 0.03 m/s²",
         "ring22_ippo": "[`ring22_ippo`](../../agents/ring22_ippo/README.md), which has learnt to "
-        "do so without a clock",
+        "drive like `gentle`, but from its sensors alone (`gentle` also reads the world's clock)",
     }
     rows = ring_rows(results)
     lines = [

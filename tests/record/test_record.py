@@ -100,7 +100,7 @@ def test_tables_that_show_the_same_driver_share_its_jobs() -> None:
     assert {job.key for job in card.jobs} < {job.key for job in all_tasks.jobs}
 
 
-def test_a_table_of_a_small_result() -> None:
+def test_a_table_shows_the_figures_of_a_small_result() -> None:
     idm, blind = (job.key for job in jobs_of(COMMAND).values())
     results = Results({idm: fake_report(collisions=0), blind: fake_report()})
     columns = [("idm", COMMAND, "idm"), ("other", COMMAND, "blind")]

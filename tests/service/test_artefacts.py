@@ -228,7 +228,7 @@ def test_an_environment_that_refers_to_a_file_outside_of_its_upload_is_refused(
     ("places", "words"),
     [
         (["map.net.xml"], "belongs to no environment"),
-        (["env.yaml", "agents/idm/config.json"], "the folder agents must have another name"),
+        (["env.yaml", "agents/idm/config.json"], "the folder name agents is reserved"),
         (["env.yaml", "drivers/a/config.json"], "must have exactly"),
         (["env.yaml", "drivers/idm/config.json", "drivers/idm/model.safetensors"], "driver 'idm'"),
     ],

@@ -182,7 +182,10 @@ def test_the_token_of_a_state_is_refused_as_a_session_token(service: LoopbackSer
 
 @pytest.mark.parametrize("how", ["state", "result", "closed", "forgotten"])
 def test_content_is_kept_while_a_configuration_uses_it(fleet: Fleet, how: str) -> None:
-    """A node stores the bytes of a configuration as content; later, its own reference ends."""
+    """A node stores the bytes of a configuration as a state or a result, and then replaces them.
+
+    In the variants `closed` and `forgotten`, the session ends instead.
+    """
     found = fleet.add_configuration(ConfigurationBody(environment="merge"))
     fleet.log.flush()
     content = fleet.log.content(found["hash"])

@@ -389,7 +389,7 @@ def test_invalid_settings_are_refused_with_the_reason(
 
 
 def test_signals_with_one_green_cannot_have_agents() -> None:
-    with pytest.raises(ConfigError, match="no signal of this map has two or more greens"):
+    with pytest.raises(ConfigError, match="no signal of this map has 2 to 64 greens"):
         make_vec("merge", agents=1, overrides=ALL)
     with pytest.raises(ConfigError, match=r"signals\.agents = none: set it"):
         _ = make_vec("merge", agents=1).signals

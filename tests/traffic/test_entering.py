@@ -111,7 +111,7 @@ def test_lane_free_is_the_emptiest_lane_or_the_rightmost_of_equally_empty_lanes(
 
 
 @pytest.mark.parametrize(("way_m", "counts"), [(2900.0, False), (3100.0, True)])
-def test_lane_best_treats_all_lanes_that_serve_the_route_for_3_km_alike(
+def test_lane_best_has_no_preference_among_lanes_that_serve_the_route_for_3_km(
     way_m: float, counts: bool
 ) -> None:
     plan = PLAN.copy()

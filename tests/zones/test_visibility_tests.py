@@ -82,8 +82,8 @@ def same_looks(found: NDArray[np.void], twin: Looks) -> None:
 def test_the_kernel_equals_its_twin(
     name: str, part: tuple[float, float, float, float], half_m: float, steered: bool
 ) -> None:
-    # Steered maps have the areas that steered cars sweep. They come from a cache, because computing
-    # these areas takes minutes without the compiler.
+    # A map from `load_steered` also has the areas that steered cars sweep. They come from a cache,
+    # because computing these areas takes minutes without the compiler.
     roads = load_steered(find_map(name)) if steered else network(name)
     min_x, min_y, max_x, max_y = roads.extent_m
     low, high = np.array([min_x, min_y] * 2), np.array([max_x, max_y] * 2)
@@ -130,8 +130,8 @@ def test_drivers_on_equal_roads_see_the_vehicles_to_which_their_foe_yields(
     middle = np.bincount(links["junction"]).argmax()
     one, other, *rest = ends = np.unique(links["from_lane"][links["junction"] == middle])
     assert len(rest) == 2
-    # Links from `one` now yield to a single link: the link from `other` with the most duties to
-    # yield.
+    # All conflicts of the links from `one` now have the same foe: the link from `other` that must
+    # yield to the most links.
     owner = np.repeat(np.arange(len(links)), links["num_conflicts"])
     yields = np.bincount(owner[conflicts["must_yield"]], minlength=len(links))
     conflicts["foe"][links["from_lane"][owner] == one] = np.argmax(
@@ -205,7 +205,7 @@ def test_a_zone_without_roads_sees_no_vehicles(line: RoadNetwork) -> None:
 
 
 @pytest.mark.parametrize("part", [(0.0, 0.0, 0.4, 1.0), (0.5, 0.5, 0.6, 0.6)])
-def test_no_visible_vehicle_is_beyond_the_farthest_distance(
+def test_farthest_m_is_the_distance_of_the_farthest_visible_vehicle(
     part: tuple[float, float, float, float],
 ) -> None:
     """The expected distance comes from closely spaced positions on all lanes."""
@@ -230,6 +230,6 @@ def test_no_visible_vehicle_is_beyond_the_farthest_distance(
     assert VIEW_M < found
 
 
-def test_without_visible_vehicles_the_farthest_distance_is_zero(line: RoadNetwork) -> None:
+def test_farthest_m_is_zero_without_visible_vehicles(line: RoadNetwork) -> None:
     rect = (0.0, 50.0, 1200.0, 90.0)
     assert farthest_m(line.arrays, np.array([rect]), 0, looks_of(line, rect)) == 0.0

@@ -59,7 +59,7 @@ def anything(value: Any) -> Any:
 
 
 def listed(check: Check, most: int = 1 << 16) -> Check:
-    """Return a check for a list of at most `most` equal elements."""
+    """Return a check for a list of at most `most` elements that all pass `check`."""
 
     def checked(value: Any) -> list[Any]:
         if not isinstance(value, list):

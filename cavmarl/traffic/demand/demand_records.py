@@ -31,7 +31,9 @@ POS_RANDOM_FREE = 4  # treated like POS_RANDOM
 POS_LAST = 5  # behind the last vehicle
 POS_MAX = 6  # arrival: at the end of the lane
 POS_CENTER = 7  # arrival: in the middle of the lane
-POS_STOP = 8  # the end of the first stop, if it is on the first edge; only in definitions
+# The end of the first stop if it is on the first edge, otherwise as POS_BASE. The resolver replaces
+# this code by POS_GIVEN or POS_BASE.
+POS_STOP = 8
 
 SPEED_GIVEN = 0
 SPEED_RANDOM = 1
