@@ -39,6 +39,7 @@ from cavmarl.learning.checkpoint import Parts, bytes_of, tensor_of
 from cavmarl.learning.data_parallel import ALONE, Ranks
 from cavmarl.learning.log import Trips, describe, mean_of_ranks, progress_bar
 from cavmarl.learning.loggers import logger_names
+from cavmarl.learning.moving_off import MovingOff, is_held_back, move_off_loss
 from cavmarl.learning.observation_norm import Scales
 from cavmarl.learning.opponents import Opponents
 from cavmarl.learning.phase_times import PhaseTimes
@@ -84,6 +85,9 @@ class Args:
     imitate: Annotated[str, "driver to imitate at first; empty: the built-in one"] = ""
     imitation_weight: Annotated[float, "initial weight of the distance to that driver"] = 0.0
     imitation_share: Annotated[float, "share of the run in which this weight falls to 0"] = 0.1
+    move_off_weight: Annotated[
+        float, "weight of moving off where the built-in driver would, with no signal in the way"
+    ] = 0.0
     start: Annotated[str, "driver to start from: weights, architecture, sensors, actions"] = ""
     end_at_red: Annotated[bool, "end returns at a red light, as at a crash"] = False
     opponents: Annotated[str, "drivers of some seats, not learnt from; comma-separated"] = ""
@@ -108,7 +112,8 @@ class Args:
 
     def __post_init__(self) -> None:
         ones = "num_envs total_agent_steps num_steps epochs minibatches hidden threads"
-        zeros = "agents zones workers seed minutes entropy_weight value_weight imitation_weight"
+        zeros = "agents zones workers seed minutes entropy_weight value_weight"
+        zeros += " imitation_weight move_off_weight"
         above = "keep learning_rate clip max_gradient_norm throttle_std steering_std"
         least = dict.fromkeys(f"{ones} checkpoint_updates".split(), 1)
         options.check_at_least(self, least | dict.fromkeys(zeros.split(), 0) | {"background": -1})
@@ -119,7 +124,14 @@ class Args:
         if self.average == 1.0:
             raise ConfigError("--average 1.0: must be below 1; at 1 the driver would not change")
         if self.residual and self.imitation_weight:
-            raise ConfigError("--residual: leave out --imitation-weight; it starts as that driver")
+            raise ConfigError(
+                "--residual: leave out --imitation-weight; the driver starts as the built-in one"
+            )
+        if self.move_off_weight and (self.residual or self.imitation_weight):
+            raise ConfigError(
+                "--move-off-weight: leave out --residual and --imitation-weight, which imitate "
+                "the built-in driver everywhere"
+            )
         if self.shared and self.mappo:
             raise ConfigError("--shared: leave out --mappo, whose critic has other inputs")
 
@@ -290,8 +302,15 @@ class Learner:
             update (Polyak and Juditsky 1992).
     """
 
-    def __init__(self, network: ActorCritic, args: Args, ranks: Ranks = ALONE) -> None:
+    def __init__(
+        self,
+        network: ActorCritic,
+        args: Args,
+        ranks: Ranks = ALONE,
+        moving_off: MovingOff | None = None,
+    ) -> None:
         self.network, self._args, self._ranks = network.to(args.device), args, ranks
+        self._moving_off = moving_off
         self.optimizer = torch.optim.Adam(network.parameters(), lr=args.learning_rate, eps=1e-5)
         self.scales = Scales(network, ranks)
         self.averaged = deepcopy(network)
@@ -309,7 +328,12 @@ class Learner:
             group["lr"] = args.learning_rate * share
         advantages = batch.advantages(args.gamma, args.gae_lambda).flatten()
         acted = batch.acted.flatten().nonzero().squeeze(1)
-        chosen = self._filtered(advantages, acted, batch.suggested is not None)
+        reluctant = self._reluctant(batch)
+        chosen = self._filtered(advantages, acted, self.imitation_weight(left) > 0.0)
+        if reluctant is not None:
+            held = acted[reluctant[acted]]
+            output = network(batch.observations.flatten(0, 2)[held]).detach()
+            chosen = torch.cat([chosen, held[is_held_back(output)]]).unique()
         found: list[Tensor] = []
         for _ in range(args.epochs):
             order = chosen[torch.randperm(len(chosen), device=chosen.device)]
@@ -317,7 +341,9 @@ class Learner:
                 self.optimizer.zero_grad()
                 count = rows.numel() if rows.numel() > 1 else 0  # one row has no deviation
                 if count:
-                    found.append(self._differentiate(batch, advantages, rows, share, left))
+                    found.append(
+                        self._differentiate(batch, advantages, reluctant, rows, share, left)
+                    )
                 if self._ranks.average_gradients(network, count):
                     for part in network.parts:
                         nn.utils.clip_grad_norm_(part, args.max_gradient_norm)
@@ -330,8 +356,22 @@ class Learner:
             name: sum(each) / len(of_ranks) for name, *each in zip(NUMBERS, *of_ranks, strict=True)
         }
 
+    def _reluctant(self, batch: Batch) -> Tensor | None:
+        """Return which of all T * W * A decisions should move off; None without that loss."""
+        if self._moving_off is None or batch.suggested is None:
+            return None
+        return self._moving_off.reluctant(
+            batch.observations.flatten(0, 2), batch.suggested.flatten(0, 2)
+        )
+
     def _differentiate(
-        self, batch: Batch, advantages: Tensor, rows: Tensor, share: float, left: float
+        self,
+        batch: Batch,
+        advantages: Tensor,
+        reluctant: Tensor | None,
+        rows: Tensor,
+        share: float,
+        left: float,
     ) -> Tensor:
         """Compute the gradients of a minibatch; return the values of `NUMBERS`."""
         args, network = self._args, self.network
@@ -353,7 +393,9 @@ class Learner:
         value_loss = (values - returns).square().mean()
         loss = policy_loss + 0.5 * args.value_weight * value_loss
         loss = loss - args.entropy_weight * share * entropy.mean()
-        if batch.suggested is not None:
+        if reluctant is not None:
+            loss = loss + args.move_off_weight * move_off_loss(output, reluctant[rows])
+        elif batch.suggested is not None:
             distance = network.distance(output, of(batch.suggested))
             loss = loss + self.imitation_weight(left) * distance.mean()
         loss.backward()  # type: ignore[no-untyped-call]
@@ -372,7 +414,7 @@ class Learner:
 
     @torch.no_grad()
     def _average(self) -> None:
-        """Move the averaged weights towards the new weights, and copy the scales."""
+        """Move the averaged weights towards the new ones, and copy the input normalisation."""
         latest, kept = self.network.state_dict(), self._args.average
         for name, tensor in self.averaged.state_dict().items():
             tensor.lerp_(latest[name], 1.0 if name in ("mean", "deviation") else 1.0 - kept)
@@ -410,7 +452,10 @@ class Run:
             residual=args.residual,
         )
         self.network = ActorCritic(self.config, (args.throttle_std, args.steering_std))
-        self.learner = Learner(self.network, args, ranks)
+        moving_off = None
+        if args.move_off_weight:
+            moving_off = MovingOff(vec.config.sensors, vec.config.action)
+        self.learner = Learner(self.network, args, ranks, moving_off)
         if args.start and not folder.began.parts:
             self.learner.scales.start(self.config, policy_files(args.start)[0].parent)
         ranks.copy_weights(self.network)
@@ -436,7 +481,8 @@ class Run:
         """Collect, learn and log; return the logged numbers."""
         started, left, collector = time.perf_counter(), 1.0 - self.done(), self.collector
         collector.times.clear()
-        batch = collector.collect(self.learner.imitation_weight(left) > 0.0)
+        suggests = self.learner.imitation_weight(left) > 0.0 or self.args.move_off_weight > 0.0
+        batch = collector.collect(suggests)
         with collector.times.of("learning"):
             numbers = self.learner.update(batch, left)
         new = sum(self.ranks.gather(int(batch.acted.sum())))

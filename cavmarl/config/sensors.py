@@ -367,6 +367,9 @@ class ConflictsConfig(
             indicate at their present or next junction. It also adds this turn as a feature.
         indicators_m: distance to the junction from which vehicles indicate; before that, their turn
             is unknown. 0: they indicate at any distance, as read from the world's state.
+        horizon_s: time for which motion is predicted, in steps of 0.5 s.
+        departs: false assumes that the ego vehicle keeps its speed, but drives at least 3 m/s. True
+            assumes that it accelerates with 2 m/s² to the speed limit of its lane.
     """
 
     count: Annotated[int, Whole(0, 64)] = 0
@@ -375,6 +378,8 @@ class ConflictsConfig(
     heard: bool = False
     indicators: bool = False
     indicators_m: Annotated[float, Within(0.0, 300.0)] = 0.0
+    horizon_s: Annotated[float, Within(0.5, 15.0)] = 4.5
+    departs: bool = False
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,11 @@ from numpy.typing import NDArray
 from cavmarl.roads.network import RoadNetwork
 
 RED, YELLOW, GREEN = "ru", "yY", "gG"
-LOOKS_S = [0.5 * k for k in range(10)]
+
+
+def looks_s(horizon_s: float) -> list[float]:
+    """Return the moments of a prediction."""
+    return [0.5 * k for k in range(round(2.0 * horizon_s) + 1)]
 
 
 @dataclass
@@ -141,12 +145,12 @@ def lines(
     return [number for line in found for number in line]
 
 
-def straight_looks(vehicle: np.void) -> list[tuple[float, float, float]]:
+def straight_looks(vehicle: np.void, horizon_s: float) -> list[tuple[float, float, float]]:
     """Return the predicted poses (x, y, direction) of a vehicle that goes straight on."""
     x, y, heading, speed = (float(vehicle[name]) for name in ("x", "y", "heading", "speed"))
     return [
         (x + time * speed * math.cos(heading), y + time * speed * math.sin(heading), heading)
-        for time in LOOKS_S
+        for time in looks_s(horizon_s)
     ]
 
 
@@ -171,13 +175,20 @@ def indicated_way(
     return way, next(iter(links), -1)
 
 
+def departing_m(speed: float, limit: float, time: float) -> float:
+    """Return the distance of a vehicle that accelerates with 2 m/s² to `limit`, in small steps."""
+    steps = 2000
+    times = (np.arange(steps) + 0.5) * (time / steps)
+    return float(np.minimum(speed + 2.0 * times, max(limit, speed)).mean() * time)
+
+
 def looks_along(
-    roads: RoadNetwork, way: list[Stretch], vehicle: np.void, speed: float
+    roads: RoadNetwork, way: list[Stretch], vehicle: np.void, driven_m: list[float]
 ) -> list[tuple[float, float, float]]:
-    """Return the present and predicted poses (x, y, direction) of a vehicle along its path."""
+    """Return the poses (x, y, direction) of a vehicle now and after distances along its path."""
     found = [(float(vehicle["x"]), float(vehicle["y"]), float(vehicle["heading"]))]
-    for time in LOOKS_S[1:]:
-        stretch, s = on_way(way, speed * time)
+    for distance in driven_m[1:]:
+        stretch, s = on_way(way, distance)
         found.append(pose(roads, stretch.lane, s))
     return found
 
@@ -190,9 +201,10 @@ def approach(
 ) -> tuple[float, float]:
     """Return the gap between two vehicles, and its time, at their most critical approach."""
     gaps = []
-    for time, (x, y, direction), (x_there, y_there, direction_there) in zip(
-        LOOKS_S, looks, others, strict=True
+    for k, ((x, y, direction), (x_there, y_there, direction_there)) in enumerate(
+        zip(looks, others, strict=True)
     ):
+        time = 0.5 * k
         dx, dy = x_there - x, y_there - y
         turned = direction_there - direction
         ends = [
@@ -269,6 +281,8 @@ def conflicts(
     told: Mapping[int, tuple[np.void, float]] | None = None,
     indicators: bool = False,
     from_m: float = 0.0,
+    horizon_s: float = 4.5,
+    departs: bool = False,
 ) -> list[float]:
     """Return features of each of the `count` most critical vehicles.
 
@@ -278,7 +292,12 @@ def conflicts(
     """
     ego = rows[i]
     way = way_of(roads, plans, ego)
-    looks = looks_along(roads, way, ego, max(float(ego["speed"]), 3.0))
+    times_s = looks_s(horizon_s)
+    speed, limit = float(ego["speed"]), float(roads.lanes[ego["lane"]]["speed_mps"])
+    driven_m = [max(speed, 3.0) * time for time in times_s]
+    if departs:
+        driven_m = [departing_m(speed, limit, time) for time in times_s]
+    looks = looks_along(roads, way, ego, driven_m)
     known = {int(row["id"]): (row, -1.0) for row in rows if int(row["id"]) not in hidden}
     known = {**(told or {}), **known}
     del known[int(ego["id"])]
@@ -287,10 +306,11 @@ def conflicts(
         away = math.hypot(other["x"] - ego["x"], other["y"] - ego["y"])
         if away > range_m or abs(other["z"] - ego["z"]) > 4.0:
             continue
-        others = straight_looks(other)
+        others = straight_looks(other, horizon_s)
         if indicators:
             its_way = indicated_way(roads, plans, other, from_m)[0]
-            others = looks_along(roads, its_way, other, float(other["speed"]))
+            its_driven_m = [float(other["speed"]) * time for time in times_s]
+            others = looks_along(roads, its_way, other, its_driven_m)
         near, when = approach(looks, others, ego, other)
         # Rounding must not decide the order of equally critical vehicles, so round and sort by id.
         ranked.append((round(near + 2.0 * when, 6), subject, near, when))
@@ -302,13 +322,12 @@ def conflicts(
         vx = other["speed"] * math.cos(other["heading"]) - ego["speed"] * cos
         vy = other["speed"] * math.sin(other["heading"]) - ego["speed"] * sin
         turned = other["heading"] - ego["heading"]
-        reach_m = LOOKS_S[-1] * max(float(ego["speed"]), 3.0)
         numbers += [2.0 / (2.0 + near), 2.0 / (2.0 + when)]
         numbers += [bent(dx * cos + dy * sin, 10.0), bent(dy * cos - dx * sin, 10.0)]
         numbers += [bent(vx * cos + vy * sin, 10.0), bent(vy * cos - vx * sin, 10.0)]
         numbers += [math.cos(turned), math.sin(turned)]
         is_seen = age_s < 0.0
-        numbers.append(goes_first(roads, way, reach_m, other, shown) if is_seen else 0.0)
+        numbers.append(goes_first(roads, way, driven_m[-1], other, shown) if is_seen else 0.0)
         if told is not None:
             numbers += [1.0, 0.0] if is_seen else [0.0, min(age_s, 1.0)]
         if indicators:

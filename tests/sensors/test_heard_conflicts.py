@@ -71,7 +71,7 @@ def hidden_from(rows: NDArray[np.void], me: np.void) -> list[int]:
     return [int(row["id"]) for row in rows if blocked(me["x"], me["y"], float(row["x"]), row["y"])]
 
 
-def test_visible_vehicles_and_reported_positions_of_hidden_ones_equal_twin() -> None:
+def test_observed_visible_and_reported_vehicles_equal_those_of_the_twin() -> None:
     vec = made({"v2x.channel.loss": 0.3})
     simulation = vec.worlds.simulation
     heard = old = 0

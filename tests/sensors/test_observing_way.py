@@ -54,6 +54,9 @@ SIGNS = {
 INDICATED = replace(CONFIG, conflicts=replace(CONFIG.conflicts, indicators=True))
 NEAR_M = 25.0
 INDICATED_NEAR = replace(CONFIG, conflicts=replace(INDICATED.conflicts, indicators_m=NEAR_M))
+DEPARTING = replace(
+    CONFIG, conflicts=replace(INDICATED_NEAR.conflicts, departs=True, horizon_s=8.0)
+)
 # These settings are those of the environment `cities`.
 ON = {
     "sensors.way.distances_m": DISTANCES_M,
@@ -140,6 +143,27 @@ def test_way_and_conflicts_equal_twin_for_any_order_of_rows(
                 roads, ways, rows, i, letters, COUNT, RANGE_M, indicators=True, from_m=from_m
             )
             assert seen == pytest.approx(twin, abs=2e-5)
+        seen = observed_conflicts(name, rows, i, phase, DEPARTING)
+        how = {"indicators": True, "from_m": NEAR_M, "horizon_s": 8.0, "departs": True}
+        twin = naive.conflicts(roads, ways, rows, i, letters, COUNT, RANGE_M, **how)
+        assert seen == pytest.approx(twin, abs=2e-5)
+
+
+def test_a_waiting_vehicle_observes_whom_it_would_meet_if_it_departed() -> None:
+    """A vehicle stands 31 m behind a standing one, which it reaches in 5.5 s with 2 m/s²."""
+    rows = on_main_road((100.0, 0.0, 0.0), (131.0, 0.0, 0.0))
+    phase = np.zeros(0, np.int32)
+    rows["length"] = 4.0
+
+    def near_and_soon(**keys: Any) -> list[float]:
+        config = replace(CONFIG, conflicts=replace(CONFIG.conflicts, **keys))
+        return observed_conflicts("merge", rows, 0, phase, config)[:2]
+
+    # At 3 m/s, the vehicle comes 13.5 m closer within 4.5 s.
+    assert near_and_soon() == pytest.approx([2.0 / (2.0 + 27.0 - 13.5), 2.0 / 6.5])
+    # It would drive 25 m within 5 s, and 30.25 m within 5.5 s.
+    assert near_and_soon(departs=True, horizon_s=5.0) == pytest.approx([2.0 / 4.0, 2.0 / 7.0])
+    assert near_and_soon(departs=True, horizon_s=8.0) == pytest.approx([1.0, 2.0 / 7.5])
 
 
 def test_the_route_of_another_vehicle_is_unknown_until_it_is_indicated() -> None:

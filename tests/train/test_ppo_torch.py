@@ -202,6 +202,10 @@ def test_the_logger_tensorboard_writes_a_file_of_events(ippo: ModuleType, here: 
         (["--env", "merg"], "did you mean merge"),
         (["--num-envs", "0"], "--num-envs 0: must be at least 1"),
         (["--learning-rate", "nan"], "--learning-rate nan: must be above 0"),
+        (
+            ["--move-off-weight", "1", "--imitation-weight", "1"],
+            "--move-off-weight: leave out --residual and --imitation-weight",
+        ),
         (["--mappo", "--shared"], "--shared: leave out --mappo"),
         (["--loggers", "tensorbord"], "--loggers tensorbord: no such logger; give some of"),
         (["--keep", "0"], "--keep 0.0: must be above 0"),

@@ -136,6 +136,7 @@ def test_a_killed_run_resumes_bit_for_bit(ippo: ModuleType, here: Path, whole: L
     [
         (["--imitation-weight", "1", "--end-at-red"], []),
         (["--imitation-weight", "1", "--imitate", "random_actions"], []),
+        (["--move-off-weight", "0.3", "--keep", "0.5"], []),
         (["--shared", "--keep", "0.5", "--opponents", "idm,random_actions"], []),
         (["--residual"], []),
         (["--mappo"], ["--zones", "2"]),

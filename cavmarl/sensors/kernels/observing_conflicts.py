@@ -1,14 +1,17 @@
 """The kernel of the `conflicts` sensor: the vehicles that come closest to the ego path.
 
 All vehicles are assumed to keep their speed: the ego vehicle along its path, others straight
-along their headings, because their plans are unknown. At a few future moments, the kernel computes
-the gap between the two bodies, as boxes along the ego axes. The vehicle whose approach is closest
-and soonest comes first. The right of way depends on the lane of the other vehicle, whichever link
-it takes from there.
+along their headings, because their plans are unknown. Every 0.5 s of the horizon, the kernel
+computes the gap between the two bodies, as boxes along the ego axes. The vehicle whose approach is
+closest and soonest comes first. The right of way depends on the lane of the other vehicle,
+whichever link it takes from there.
 
 With `indicators`, other vehicles are assumed to follow their lanes and, over the current or next
 junction, the link that they indicate. After that they go straight. A vehicle farther from its
 junction than `indicators_m` does not indicate yet, and is assumed to go straight over it.
+
+With `departs`, the ego vehicle is assumed to accelerate to the speed limit of its lane, so a
+vehicle that waits at a junction observes what it would meet if it went now.
 
 With `heard`, vehicles that are known only from a message are included; their positions are
 extrapolated from the position and speed in the message. Their lanes are unknown.
@@ -43,8 +46,8 @@ HEARD_FEATURES = 2  # additional features with `heard`
 INDICATED_FEATURES = 1  # additional features with `indicators`
 INDICATED_RAD = 0.4  # a link that turns by less is not indicated
 AGE_SCALE_S = 1.0
-NUM_LOOKS = 10  # number of predicted moments
 LOOK_S = 0.5  # time between predicted moments
+DEPART_MPS2 = 2.0  # assumed acceleration with `departs`
 SLOWEST_MPS = 3.0  # the ego vehicle is assumed to drive at least this fast, even if stopped
 WAIT_MPS = 2.0  # in the ranking, an approach 1 s later counts as this many metres farther
 GAP_HALF_M = 2.0  # a gap of this length has a closeness of 0.5
@@ -73,9 +76,10 @@ class ConflictsSensor(NamedTuple):
     told: NDArray[np.void]  # BODY (inbox,) scratch: current positions of the vehicles in messages
     indicators: bool  # whether other vehicles indicate their link over the next junction
     indicators_m: float  # distance to the junction within which they indicate it; 0: any
-    looks: NDArray[np.float64]  # (NUM_LOOKS, 4) scratch: predicted poses of the ego vehicle
-    heard_looks: NDArray[np.float64]  # (NUM_LOOKS, 4) scratch: poses of a vehicle in a message
-    others: NDArray[np.float64]  # (capacity, NUM_LOOKS, 4) scratch: poses of `Grid.bodies`
+    departs: bool  # whether the ego vehicle is assumed to accelerate to the speed limit
+    looks: NDArray[np.float64]  # (L, 4) scratch: predicted poses of the ego vehicle
+    heard_looks: NDArray[np.float64]  # (L, 4) scratch: poses of a vehicle in a message
+    others: NDArray[np.float64]  # (capacity, L, 4) scratch: poses of `Grid.bodies`
     indicated: NDArray[np.float64]  # (capacity,) indicated turn of each body: 1 left, -1 right
     foreseen: NDArray[np.int64]  # (capacity,) the `filling` for which each body was predicted
     filling: NDArray[np.int64]  # (1,) how many times the grid has been filled
@@ -89,24 +93,38 @@ def _saturate(value: float, half: float) -> float:
 
 
 @kernel
+def _driven(look: int, speed: float, most_speed: float) -> float:
+    """Return the distance at a predicted moment: from `speed`, accelerating to `most_speed`."""
+    time = LOOK_S * look
+    if speed >= most_speed:
+        return speed * time
+    gaining = min((most_speed - speed) / DEPART_MPS2, time)
+    top = speed + DEPART_MPS2 * gaining
+    return 0.5 * (speed + top) * gaining + top * (time - gaining)
+
+
+@kernel
 def _predict_on_path(
     roads: RoadArrays,
     travel: TripTables,
     row: np.void,
     speed: float,
+    most_speed: float,
     num_links: int,
     looks: NDArray[np.float64],
 ) -> tuple[int, bool]:
-    """Predict a vehicle's poses at `speed`; `looks` (NUM_LOOKS, 4) gets x, y, cos and sin.
+    """Predict a vehicle's poses; `looks` (L, 4) gets x, y, cos and sin.
 
-    The vehicle follows its path over at most `num_links` links, then goes straight. Returns the
+    The vehicle accelerates from `speed` to `most_speed`, or keeps a speed that is not lower.
+
+    It follows its path over at most `num_links` links, then goes straight. Returns the
     first of these links (-1: none), and whether the vehicle is on it.
     """
     looks[0, 0] = row["x"]
     looks[0, 1] = row["y"]
     looks[0, 2] = cosine(row["heading"])
     looks[0, 3] = sine(row["heading"])
-    stride = LOOK_S * speed
+    num_looks = looks.shape[0]
     lane, way = row["lane"], row["way"]
     here = roads.lanes[lane]
     crossed = here["link"] if here["internal"] else -1
@@ -120,9 +138,12 @@ def _predict_on_path(
         if link >= 0:
             following = following if left > 0 else -1
             left -= 1
-        while written < NUM_LOOKS and (written * stride <= end or following < 0):
+        while written < num_looks:
+            driven = _driven(written, speed, most_speed)
+            if driven > end and following >= 0:
+                break
             x, y, _, cos, sin, _ = lane_pose(
-                roads.points, here["first_point"], here["num_points"], written * stride - start
+                roads.points, here["first_point"], here["num_points"], driven - start
             )
             looks[written, 0] = x
             looks[written, 1] = y
@@ -131,12 +152,12 @@ def _predict_on_path(
             written += 1
         if crossed < 0 and link >= 0 and following >= 0:
             crossed = link
-        if written == NUM_LOOKS or following < 0:
+        if written == num_looks or following < 0:
             break
         lane, way, start = following, way_there, end
         here = roads.lanes[lane]
     # If the path has too many short lanes, the prediction stops at the last one.
-    for k in range(written, NUM_LOOKS):
+    for k in range(written, num_looks):
         for axis in range(4):
             looks[k, axis] = looks[written - 1, axis]
     return crossed, is_on
@@ -145,7 +166,7 @@ def _predict_on_path(
 @kernel
 def _predict_straight(body: np.void, looks: NDArray[np.float64]) -> None:
     """Predict the poses of a body that keeps its speed and heading."""
-    for k in range(NUM_LOOKS):
+    for k in range(looks.shape[0]):
         time = LOOK_S * k
         looks[k, 0] = body["x"] + time * body["speed"] * body["cos"]
         looks[k, 1] = body["y"] + time * body["speed"] * body["sin"]
@@ -211,7 +232,8 @@ def _predict_other(
     sensor.indicated[at] = 0.0
     if sensor.indicators and other["driver"] != DRIVER_SCRIPTED and not is_off_lanes(other):
         links = 1 if _indicates(roads, travel, other, sensor) else 0
-        link, _ = _predict_on_path(roads, travel, other, other["speed"], links, sensor.others[at])
+        speed = other["speed"]
+        link, _ = _predict_on_path(roads, travel, other, speed, speed, links, sensor.others[at])
         sensor.indicated[at] = _turn_of(roads, link)
     else:
         _predict_straight(body, sensor.others[at])
@@ -224,14 +246,14 @@ def _nearest_approach(
     """Return the gap in m and the time in s of the most critical approach between two boxes.
 
     The gap is the sum of the gaps along and across the ego vehicle; later gaps count as larger.
-    `looks`, `others` (NUM_LOOKS, 4): predicted poses of the ego vehicle and of the body.
+    `looks`, `others` (L, 4): predicted poses of the ego vehicle and of the body.
     """
     half_length = 0.5 * row["length"]
     half_width = 0.5 * row["width"]
     best = math.inf
     near = 0.0
     when = 0.0
-    for k in range(NUM_LOOKS):
+    for k in range(looks.shape[0]):
         time = LOOK_S * k
         cos, sin = looks[k, 2], looks[k, 3]
         dx = others[k, 0] - looks[k, 0]
@@ -406,8 +428,10 @@ def observe_conflicts(
     (N,) of vehicles in the agent's inbox; read only with `heard`. `tick`: the world's tick.
     """
     row = rows[i]
-    speed = max(row["speed"], SLOWEST_MPS)
-    link, is_on = _predict_on_path(roads, travel, row, speed, MOST_LANES, sensor.looks)
+    speed = most_speed = max(row["speed"], SLOWEST_MPS)
+    if sensor.departs:
+        speed, most_speed = row["speed"], roads.lanes[row["lane"]]["speed_mps"]
+    link, is_on = _predict_on_path(roads, travel, row, speed, most_speed, MOST_LANES, sensor.looks)
     num_told = _take_reports(reports, tick, tick_s, sensor.told) if sensor.heard else 0
     found = _rank(roads, travel, grid, rows, i, num_told, sensor)
     cos_heading = sensor.looks[0, 2]

@@ -20,7 +20,7 @@ from cavmarl.sensors.mounted.mounted_sensor import Bounds, ImagingSensor, Platfo
 C = TypeVar("C", LidarRigConfig, RadarConfig)
 Floats = NDArray[np.float64]
 
-ECHO_MARGIN_M = 0.05  # a ray that ends less than this before the range counts as without echo
+ECHO_MARGIN_M = 0.05  # a ray whose distance is within this margin of the range has no echo
 
 
 def azimuths(fov_deg: float, rays: int) -> tuple[float, float, int]:
@@ -51,7 +51,7 @@ def lidar_directions(
 
 
 def has_echo(distances_m: Floats, range_m: float) -> NDArray[np.bool_]:
-    """Return which rays with these distances have hit something; other rays end at the range."""
+    """Return for each distance whether its ray has hit something; else it is `range_m`."""
     return distances_m < range_m - ECHO_MARGIN_M
 
 

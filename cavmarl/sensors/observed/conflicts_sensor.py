@@ -16,7 +16,7 @@ from cavmarl.sensors.kernels.observing_conflicts import (
     GAP_HALF_M,
     HEARD_FEATURES,
     INDICATED_FEATURES,
-    NUM_LOOKS,
+    LOOK_S,
     PLACE_HALF_M,
     RANKED,
     SPEED_HALF_MPS,
@@ -35,13 +35,13 @@ def features(config: SensorsConfig) -> list[Feature]:
     rows: tuple[tuple[str, str, str, float], ...] = (
         (
             "near",
-            f"closeness: {GAP_HALF_M:g} m / ({GAP_HALF_M:g} m + gap); 0: none",
+            f"nearest approach: {GAP_HALF_M:g} m / ({GAP_HALF_M:g} m + gap); 0: none",
             "",
             0.0,
         ),
         (
             "soon",
-            f"soonness: {WHEN_HALF_S:g} s / ({WHEN_HALF_S:g} s + time); 0: none",
+            f"soonness of this approach: {WHEN_HALF_S:g} s / ({WHEN_HALF_S:g} s + time); 0: none",
             "",
             0.0,
         ),
@@ -89,6 +89,7 @@ def settings(
     """Return the kernel's settings; `most_told`: vehicles per inbox; `capacity`: rows per world."""
     given = config.conflicts
     capacity = capacity if given.count else 0
+    num_looks = round(given.horizon_s / LOOK_S) + 1
     return ConflictsSensor(
         at,
         given.count,
@@ -98,9 +99,10 @@ def settings(
         told=np.zeros(most_told, BODY),
         indicators=given.indicators,
         indicators_m=given.indicators_m,
-        looks=np.zeros((NUM_LOOKS, 4)),
-        heard_looks=np.zeros((NUM_LOOKS, 4)),
-        others=np.zeros((capacity, NUM_LOOKS, 4)),
+        departs=given.departs,
+        looks=np.zeros((num_looks, 4)),
+        heard_looks=np.zeros((num_looks, 4)),
+        others=np.zeros((capacity, num_looks, 4)),
         indicated=np.zeros(capacity),
         foreseen=np.zeros(capacity, np.int64),
         filling=np.ones(1, np.int64),

@@ -18,10 +18,16 @@ def features(config: SensorsConfig) -> list[Feature]:
         ("speed", "speed along the heading", _SPEED),
     )
     return [
-        Feature(f"{name}_{k}", f"{k} steps before the last: {meaning}", scale)
+        Feature(f"{name}_{k}", f"{_when(k)}: {meaning}", scale)
         for k in range(config.history.steps)
         for name, meaning, scale in rows
     ]
+
+
+def _when(k: int) -> str:
+    if k == 0:
+        return "last step"
+    return "step before the last" if k == 1 else f"{k} steps before the last"
 
 
 def shape(config: SensorsConfig) -> tuple[int, ...]:

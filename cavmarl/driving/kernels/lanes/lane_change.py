@@ -12,7 +12,6 @@ POLITENESS = 0.0  # weight of the followers' gains, from 0 (selfish) to 1
 MIN_ACCEL_GAIN = 0.2  # m/s², smallest gain of acceleration for which a driver changes lanes
 MAX_BRAKING_IMPOSED = 2.0  # m/s², a change that imposes harder braking is unsafe
 LANE_CHANGE_DELAY_S = 1.0  # time between two decisions of a driver
-MIN_SPEED_MPS = 1.0  # slower cars change lanes only if their route needs it
 
 
 @kernel

@@ -45,6 +45,7 @@ QUEUED_M = 7.5  # length of lane per vehicle in a queue
 TURN_IN_M = 5.0  # up to this far behind a junction, turning long vehicles cover adjacent lanes
 SPARE_M = 2.0  # on a short lane, `TURN_IN_M` is reduced so that this much room is left
 SLOW_MPS = 2.0  # below this speed, a lane change needs side clearance to stopped vehicles
+MIN_SPEED_MPS = 1.0  # slower cars change lanes only if their route needs it
 CREEP_MPS = 1.0  # up to this speed, a mandatory change is possible up to the lane's very end
 SIDEWAYS_S = 2.5  # duration of a lane change, which has to end before the lane does
 BRAKE_TIME_S = 0.5  # braking that ends within this time does not count
@@ -283,7 +284,7 @@ def _may_change(
     if rest < (0.5 * row["length"] if needed == 0 or row["speed"] > CREEP_MPS else 0.0):
         return False
     if needed == 0:
-        if row["speed"] < 1.0 or change_for_stop(roads, travel, row) == STAY:
+        if row["speed"] < MIN_SPEED_MPS or change_for_stop(roads, travel, row) == STAY:
             return False
         # Early exit: even on an empty lane the gain would be too small.
         kind = travel.types[row["vtype"]]
