@@ -1,9 +1,10 @@
 """Replay of load traces through each placement strategy, compared with static placement.
 
-The replay uses a model of true times. A worker gets the share of its processor that other programs
-leave, so its shards take their cost / (1 - CPU). Used memory and a used GPU do not slow a worker
-down. All workers wait for the slowest worker. A moved shard costs the rule's `move_s` once, and a
-vehicle that changes its zone because the map is cut again costs `HANDOFF_S`.
+The replay computes the time of each tick from the recorded costs and loads, with a simple model. A
+worker gets the share of its processor that other programs leave, so its shards take their cost /
+(1 - CPU). Used memory and a used GPU do not slow a worker down. All workers wait for the slowest
+worker. A moved shard costs the rule's `move_s` once, and a vehicle that changes its zone because
+the map is cut again costs `HANDOFF_S`.
 """
 
 from __future__ import annotations

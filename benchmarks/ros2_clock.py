@@ -64,8 +64,8 @@ def measure(
         ("world", "node"),
         [
             f"{report['steps_per_s']:.0f} steps/s of the wall clock; commands: {counts}",
-            f"the bridge ticked {found.own_ticks} times ({found.answer}); the world noticed "
-            f"{found.drift_events} times that it had advanced",
+            f"the bridge ticked {found.own_ticks} times (own ticks: {found.answer}); the master "
+            f"detected {found.drift_events} times that the world had advanced without it",
         ],
         report,
     )

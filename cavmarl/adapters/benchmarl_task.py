@@ -83,7 +83,7 @@ class CavTaskClass(TaskClass):  # type: ignore[misc] # only installed in a separ
         return load_config(self.config["env"], overrides=self._overrides, **named)[0]
 
     def supports_continuous_actions(self) -> bool:
-        """Return whether all actions can be continuous: there are no agents beside the road."""
+        """Return whether all actions can be continuous: only vehicles have agents."""
         return self._world.roadside is None
 
     def supports_discrete_actions(self) -> bool:
@@ -118,7 +118,7 @@ class CavTaskClass(TaskClass):  # type: ignore[misc] # only installed in a separ
         return env.full_action_spec_unbatched
 
     def action_mask_spec(self, env: CavTorchRLEnv) -> Composite | None:
-        """Return the spec of the action masks of one world; None without agents beside the road."""
+        """Return the spec of the action masks of one world; None if only vehicles have agents."""
         return None if self._world.roadside is None else self._of_agents(env, "action_mask")
 
     @staticmethod

@@ -38,7 +38,8 @@ class CavEgoEnv(WithSpec, OwnWorlds, gymnasium.Env[Any, Any]):
         arguments: other keyword arguments of `parallel_env`.
 
     Raises:
-        ConfigError: this view sets one of the keys, or a value is not allowed.
+        ConfigError: `overrides`, `config` or `arguments` have a key that this view sets itself
+            (`agents`, `population.agents`, `population.budget`), or a value is not allowed.
     """
 
     metadata: dict[str, Any] = CavEnv.metadata

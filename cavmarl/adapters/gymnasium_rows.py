@@ -40,10 +40,11 @@ class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
     observation. With `SAME_STEP`, that observation is in `infos["final_obs"]`, and the row's last
     infos are in `infos["final_info"]`. Infos also have every term by its name.
 
-    With `DISABLED`, `reset(options={"reset_mask": …})` takes a mask of rows (num_envs,). A world
-    that is over resets if any of its rows is chosen. A world that continues resets if all of its
-    rows are chosen; otherwise its chosen rows must have ended, and wait as usual, with observations
-    of 0 until they have a vehicle. The horizon truncates all rows of a world.
+    With `DISABLED`, `reset(options={"reset_mask": …})` takes a mask of rows (num_envs,). If a
+    world is over, it resets if any of its rows is chosen. If a world is not over, it resets only if
+    all of its rows are chosen. If only some of them are chosen, these rows must have ended. They
+    then wait, with observations of 0, until they have a vehicle. The horizon truncates all rows of
+    a world.
 
     The frame of a row is the frame of its world.
 
@@ -59,8 +60,9 @@ class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
         arguments: other keyword arguments of `make_vec`.
 
     Raises:
-        ConfigError: the rows cannot be distributed over the worlds, this view sets one of the keys,
-            or a value is not allowed.
+        ConfigError: the rows cannot be distributed over the worlds; `overrides` or `arguments` have
+            a key that this view sets itself (`agents`, `population.budget`, and in worlds that are
+            not `open` `population.agents`); or a value is not allowed.
     """
 
     closed = True  # Gymnasium calls close() on garbage collection, even without an __init__

@@ -370,7 +370,7 @@ class EnvConfig(Section, key=""):
         return found if found is not None and found.have_agents else None
 
     def refusal_of_agents(self, what: str) -> str:
-        """Return why `what` cannot have agents beside the road; empty without such agents."""
+        """Return why `what` cannot have agents of signals or limits; empty without such agents."""
         return "" if self.roadside is None else self.roadside.refusal_of_agents(what)
 
     @property

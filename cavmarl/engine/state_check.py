@@ -140,7 +140,10 @@ class StateForm(NamedTuple):
     def _wrong_external(
         self, arrays: Sequence[Array], vehicles: Sequence[Array], is_whole: bool
     ) -> str:
-        """Check that the external vehicles match the slots."""
+        """Return what is wrong if external vehicles do not match their slots; empty if nothing.
+
+        A slot is a place for a vehicle that the caller poses or drives, see `ExternalComponent`.
+        """
         zones, at = self.division.count, 0
         for part in self.attached:
             number = sum(1 for _ in part.arrays())
@@ -244,7 +247,7 @@ class StateForm(NamedTuple):
             if (waiting["speed_factor"] < LEAST_FACTOR).any():
                 return f"world {w} has a vehicle in the queue that never drives"
             check = self.division.row_check
-            # SUMO numbers vehicles as they enter, so their number is unknown.
+            # SUMO's vehicles get order numbers when they enter, so the largest one is not known.
             numbers = num_orders if self.traffic.sumo is None else MOST
             wrong = check.wrong(rows, tail, numbers) or _wrong_codes(waiting)
             wrong = wrong or check.wrong(_as_vehicles(waiting), tail, numbers)

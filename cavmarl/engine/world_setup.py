@@ -77,7 +77,7 @@ class World(NamedTuple):
 
     @property
     def signal_sizes(self) -> SignalSizes:
-        """Sizes of the arrays about signals with agents, or other agents beside the road."""
+        """Sizes of the arrays about agents of signals or of speed limits."""
         return roadside_sizes(self.config, self.network)
 
     @property

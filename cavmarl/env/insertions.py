@@ -97,8 +97,9 @@ class Insertions:
         used, waiting = int(self._used[world]), int(self._waiting[world])
         if used + len(rows) > self._most:
             raise CapacityError(
-                f"world {world}, {len(rows)} more vehicles: {used} of population.insertions = "
-                f"{self._most} have been inserted in this episode; set it higher, or reset"
+                f"world {world}: cannot insert {len(rows)} more, because population.insertions = "
+                f"{self._most} and {used} are used in this episode; increase "
+                "population.insertions, or reset"
             )
         self._rows[world, waiting : waiting + len(rows)] = rows
         self._waiting[world] += len(rows)
@@ -145,5 +146,5 @@ def wrong_insertions(rows: NDArray[np.float64], lanes: NDArray[np.void]) -> str:
     if not np.isin(lane, np.arange(len(lanes))).all():
         return "an insertion is on a lane that does not exist"
     if not ((position_m >= 0.0) & (position_m <= lanes["length_m"][lane.astype(int)])).all():
-        return "an insertion is beside its lane"
+        return "an insertion is before the start or beyond the end of its lane"
     return ""

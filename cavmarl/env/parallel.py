@@ -88,7 +88,8 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
     for bit (docs/guides/divide_a_world.md).
 
     Args:
-        worlds: one world. It must not reset in the same step; `reset` begins its next episode.
+        worlds: a `SteppedWorlds` with one world, made with `in_next_step=True`, so that the world
+            does not reset within the step that ends an episode. `reset` begins its next episode.
         seed: seed of the first reset if that call has none.
         render_mode: `human`, `rgb_array` or None.
     """
@@ -358,12 +359,16 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         The arrays are as in `SensorFrames`, without the axes of worlds and agents.
 
         Raises:
-            ActionError: there is no such agent, or it is beside the road and has no sensors.
+            ActionError: there is no such agent, or it is a signal or a roadside unit, which has no
+                sensors.
         """
         if agent not in self.possible_agents:
             raise self._no_agent(agent)
         if self._is_roadside(agent):
-            raise ActionError(f"frames({agent!r}): signals have no sensors; give a vehicle's id")
+            raise ActionError(
+                f"frames({agent!r}): signals and roadside units have no sensors; give a vehicle's "
+                "id"
+            )
         if self._visitors is not None and agent in self._visitors:
             return self._visitors.frames_of(self._visitors.ids.index(agent))
         k = self.possible_agents.index(agent)

@@ -1,4 +1,4 @@
-"""`RoadsideAgents`: agents beside the road, with their spaces and checks."""
+"""`RoadsideAgents`: agents of signals or of speed limits, with their spaces and checks."""
 
 from __future__ import annotations
 

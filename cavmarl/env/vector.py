@@ -35,7 +35,8 @@ MAX_WORLDS = 65_536
 Observations: TypeAlias = Any
 """(W, A, D) float32, or for each sensor of the rig an array (W, A, …)."""
 
-# With agents beside the road, the first four items are dicts: `vehicles`, `signals` or `limits`.
+# With agents of signals or limits, the first four items are dicts with the keys `vehicles`, and
+# `signals` or `limits`.
 StepResult = tuple[Observations, Any, Any, Any, dict[str, Any]]
 
 
@@ -155,7 +156,7 @@ class CavVectorEnv(WorldsEnvironment):
         self._copy = copy
 
     def _add_roadside(self, agents: RoadsideAgents) -> None:
-        """Add the spaces of agents beside the road, padded to the largest one."""
+        """Add the spaces of roadside agents, padded to the largest one."""
         counts = agents.num_choices.astype(np.int64)
         choices = np.broadcast_to(counts, (self.num_envs, len(counts)))
         seen = batch_space(agents.padded_observation_space, len(counts))
@@ -315,7 +316,7 @@ class CavVectorEnv(WorldsEnvironment):
         )
 
     def _split(self, actions: Any, roadside: RoadsideAgents) -> tuple[Any, NDArray[np.int64]]:
-        """Return the actions of vehicles and the choices of agents beside the road."""
+        """Return the actions of vehicles and the choices of roadside agents."""
         kind = roadside.kind
         if not isinstance(actions, Mapping) or actions.keys() - {VEHICLES, kind}:
             raise ActionError(
@@ -414,7 +415,7 @@ class CavVectorEnv(WorldsEnvironment):
     def suggest_actions(self) -> Any:
         """Return what the built-in driver (IDM, MOBIL, lane controller) would do for each agent.
 
-        With agents beside the road, return a dict; signals follow the durations of the map's
+        With agents of signals or limits, return a dict; signals follow the durations of the map's
         programs, and limits rise to the highest one.
 
         Raises:

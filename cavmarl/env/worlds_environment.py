@@ -142,7 +142,7 @@ class WorldsEnvironment(OwnWorlds):
 
     @property
     def roadside(self) -> RoadsideAgents | None:
-        """The agents beside the road, at signals or for limits; None: there are none."""
+        """The agents of signals or of speed limits; None: there are none."""
         return self._session.roadside
 
     def insert_vehicle(self, lane: str, position_m: float, world: int = 0) -> None:

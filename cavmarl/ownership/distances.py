@@ -1,10 +1,12 @@
 """The three distances at a border, and the minimum width of the overlap.
 
-    approach      the owner begins to offer the vehicle                  PREPARE
-    control       the vehicle is beyond the border and the hysteresis    SWITCH
-    overlap       the vehicle is outside of the old zone's halo          RELEASE
+    distance      side of the border    what happens there                   step of a transfer
+    approach_m    before                the owner begins to offer a vehicle  PREPARE
+    hysteresis_m  beyond                the vehicle changes its owner        SWITCH
+    overlap_m     beyond                the old zone drops its ghost         RELEASE
 
-`zones/kernels/borders.py` finds the vehicles that are offered and that switch.
+`docs/explanation/ownership.md` explains the steps. `zones/kernels/borders.py` finds the vehicles
+that are offered and that switch.
 """
 
 from __future__ import annotations
@@ -39,8 +41,9 @@ def needed_overlap_m(
 ) -> float:
     """Return the minimum overlap, B = R + h + (D + 1) · v_max · dt.
 
-    A zone may keep a vehicle for D more ticks. It must see everything within `reach_m` of the
-    vehicle, however far the vehicle has moved in that time.
+    A zone may keep a vehicle for D = `limits.deferral` ticks after the vehicle has crossed the
+    border and the hysteresis h. It must see everything within R = `reach_m` of the vehicle, however
+    far the vehicle has moved in that time.
     """
     return reach_m + hysteresis_m + (limits.deferral + 1) * v_max_mps * dt_s
 

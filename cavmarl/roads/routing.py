@@ -26,7 +26,7 @@ PLAN = record(
     ("shift", np.int32),  # change of VEHICLE["way"] on `next`, see `lanes.route_following`
     ("change", np.int16),  # side of the better lane: 1 left, -1 right, 0: this lane is best
     ("changes", np.int16),  # number of lane changes to the best lane of this edge
-    ("turnarounds", np.int16),  # number of U-turns on the route; only where a road ends
+    ("turnarounds", np.int16),  # U-turns on the route; plans use them only where roads end
     # distance from the lane's start after which a lane change is needed, m
     ("room", np.float64),
     ("to_go", np.float64),  # m from the lane's start to the end of the goal edge; inf: no route

@@ -34,17 +34,19 @@ class PublishedLine:
         command: the command, as the page shows it.
         text: patterns of prose or of whole rows, in which `{}` stands for a number. Each occurs
             once in the page.
-        values: for each `{}`, an expression that finds the value in the command's JSON. An empty
-            expression means that the number is not compared: it is a condition of the page, or in a
-            line with by_hand. With the tolerance `range`, two numbers have one expression.
+        values: for each `{}`, an expression that finds the value in the command's JSON. If an
+            expression is empty, the number is not compared. Leave it empty for a setting that the
+            page states, and in lines with by_hand. With the tolerance `range`, two numbers have one
+            expression.
         table: beginning of the header row of a table.
         section: heading above the table; empty if the header row is unique in the page. Without
             text and table, the line has all numbers of this section that no other line has.
         nth: number of the table among the tables with this header in this section, from 1.
         row: path of the object to which the expressions of columns are relative.
-        word: placeholder for a row of the table in the command and the expressions, for example
-            `NAME`. `NAME_` stands for the same text with `_` in place of `-`.
-        rows: label of a row → text that replaces the word; empty: all rows, with their labels.
+        word: placeholder in the command, the expressions and `row`, for example `NAME`. For each
+            row of the table, the row's value in `rows` replaces it. In `NAME_…`, the value has `_`
+            in place of `-`; the final `_` stays.
+        rows: label of a row → value that replaces the word; empty: all rows, with their labels.
         columns: head → expression.
         tolerance: `exact` (equal in the digits of the page); `N %` of the published number; `N`;
             `range` (measured values lie between the two published numbers); `range N %` (the range

@@ -141,10 +141,10 @@ def test_a_vehicle_that_stops_at_a_line_keeps_a_gap_to_a_rear_over_the_line(over
 @pytest.mark.parametrize(("length_m", "over_m", "minds"), [
     (12.0, 2.0, True), (12.0, -1.0, False), (12.0, 13.0, False), (5.0, 2.0, False),
 ])  # fmt: skip
-def test_a_long_vehicle_that_turns_from_the_adjacent_lane_is_a_leader_on_an_ending_lane(
+def test_vehicles_on_an_ending_lane_follow_a_long_vehicle_that_turns_from_the_adjacent_lane(
     length_m: float, over_m: float, minds: bool
 ) -> None:
-    """`over_m` is the distance of its front beyond the line. Its rear swings out over the lane."""
+    """`over_m`: distance of the long vehicle's front beyond the line. Its rear swings out."""
     roads, tables = network("merge"), travel("merge")
     lanes = roads.lanes.copy()
     leads = (lanes["num_links"] > 0) & (lanes["left"] >= 0)

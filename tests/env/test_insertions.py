@@ -168,7 +168,7 @@ def test_invalid_insertions_are_refused_with_a_remedy() -> None:
             vec.insert_vehicle(lane, 1.0, world=2)
         for _ in range(2):
             vec.insert_vehicle(lane, 10.0, world=1)
-        with pytest.raises(CapacityError, match="set it higher, or reset"):
+        with pytest.raises(CapacityError, match=r"increase population\.insertions, or reset"):
             vec.insert_vehicle(lane, 10.0, world=1)
         vec.insert_vehicle(lane, 10.0, world=0)
         vec.reset()

@@ -117,8 +117,8 @@ SIZES = -2
         (CLIPPED, 0, -1, "a count of tolerated actions is negative"),
         (INSERTED, 1, 1e9, "an insertion is on a lane that does not exist"),
         (INSERTED, 1, 0.5, "an insertion is on a lane that does not exist"),
-        (INSERTED, 2, -1.0, "an insertion is beside its lane"),
-        (INSERTED, 2, np.nan, "an insertion is beside its lane"),
+        (INSERTED, 2, -1.0, "an insertion is before the start or beyond the end of its lane"),
+        (INSERTED, 2, np.nan, "an insertion is before the start or beyond the end of its lane"),
         (SIZES, 0, -1, "a world has a negative size"),
     ],
 )

@@ -652,7 +652,7 @@ def test_calls_for_vehicles_refuse_the_names_of_signal_agents() -> None:
         for action, message in ((7, "is 7, must be from 0 to 1"), (0.5, "must be one whole num")):
             with pytest.raises(ActionError, match=message):
                 env.check_action(name, action)
-        with pytest.raises(ActionError, match="signals have no sensors; give a vehicle's id"):
+        with pytest.raises(ActionError, match="signals and roadside units have no sensors"):
             env.frames(name)
         with pytest.raises(ActionError, match=r"give an id of a vehicle from env\.agents"):
             env.declare_event(name, "obstacle")

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 _SIDES = {
     "cavmarl": "cavmarl",
-    "cavmarl_recipe": "cavmarl, our recipe",
+    "cavmarl_recipe": "cavmarl, recommended settings",
     "stable_baselines3": "SB3 on highway-env",
 }
 _PHASES = {

@@ -126,9 +126,10 @@ class VehicleControls:
         self.steering_rad = 0.0
 
     def control(self, due_ns: int, speed_mps: float) -> list[float]:
-        """Return throttle and steering in [-1, 1], and count the kind of their command.
+        """Return throttle and steering in [-1, 1]; count whether they are used, held or limited.
 
-        `due_ns`: earliest time of a command that is in time. `speed_mps`: speed of the vehicle.
+        `ControlCounts` explains the counts. `due_ns`: a command with an earlier time stamp counts
+        as held. `speed_mps`: speed of the vehicle.
         """
         if self._last is None:
             self.counts.held += 1

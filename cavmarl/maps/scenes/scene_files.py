@@ -35,7 +35,9 @@ from cavmarl.maps.scenes.scene_pickle import unpickle
 MOST_BYTES = 1 << 26
 MOST_TIMES = 100_000
 MOST_TRACKS = 4_000  # 900 in Waymo's scenes
-MOST_SAMPLES = 10_000_000  # limit of all tracks; in a pickle, tracks may share their arrays
+# Limit of the samples of all tracks together. MOST_BYTES does not bound them, because tracks in a
+# pickle may share arrays.
+MOST_SAMPLES = 10_000_000
 GPUDRIVE_STEP_S = 0.1  # not stated in the file; Waymo's motion data set has 10 Hz
 _MOVING_MPS = 2.0  # above this speed, the heading fits the direction of the motion
 _ALONG_COS, _MOST_MISFITS = 0.97, 0.05  # 14°; allowed share of points beyond this angle

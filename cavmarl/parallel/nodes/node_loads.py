@@ -49,7 +49,9 @@ class MachineWatch:
         self._watch = _watch([])
 
     def since(self, pids: Sequence[int]) -> list[Any]:
-        """Return the shares of `Utilisation` since the previous call, and their source.
+        """Return the used shares since the previous call, and the source of the GPU's value.
+
+        The shares are the fields of `Utilisation`: CPU, RAM and GPU.
 
         Args:
             pids: processes of this run on this machine from now on.
@@ -72,7 +74,11 @@ def machine_watch(purpose: str) -> MachineWatch:
 def load_report(
     payload: Any, links: Links, simulation: Simulation, zones: Sequence[int]
 ) -> list[Any]:
-    """Return the load of the machine, as a `MachineAsked` requests; None: the load of the node."""
+    """Return what the payload requests.
+
+    `payload`: None: the load of this node (`totals`). A `MachineAsked`: the load of this machine
+    or, for the purpose `LINKS`, the quality of the connections.
+    """
     if payload is not None:
         asked = MachineAsked(*payload)
         if asked.purpose == LINKS:

@@ -56,7 +56,7 @@ class StepArrays(NamedTuple):
     external: NDArray[np.float64]  # (W, E, K)
     overridden: NDArray[np.int32]  # (W, N, 2)
     lane_changes: NDArray[np.float64]  # (W, N, 3)
-    # Arrays of S agents that control signals or are beside the road (`RoadsideAgents`):
+    # Arrays of S agents of signals or of speed limits (`RoadsideAgents`):
     signal_choices: NDArray[np.int64]  # (W, S)
     signal_observations: NDArray[np.float32]  # (W, S, D) see `SignalOutputs`, also for the next 8
     signal_rewards: NDArray[np.float32]  # (W, S)

@@ -22,9 +22,9 @@ MAX_SCALE = 1000.0
 
 # Reasons why options are ignored, by kind or name; other options are "not modelled".
 _REASONS = {
-    "seed": "is not used: the seed of the world is",
+    "seed": "is not used; the world's own seed is used instead",
     "unread": "is not read",
-    "step-length": "is not used: a tick lasts `clock.sim_dt_s`",
+    "step-length": "is not used; a tick lasts `clock.sim_dt_s`",
     "time-to-teleport": "is not modelled: no vehicle is teleported",
 }
 

@@ -124,9 +124,9 @@ def test_bad_routes_are_left_out_if_the_configuration_ignores_them(read: Read) -
     ("option", "words"),
     [
         ('<max-num-vehicles value="3"/>', "option max-num-vehicles = 3 is not modelled"),
-        ('<step-length value="0.5"/>', "option step-length = 0.5 is not used: a tick lasts"),
+        ('<step-length value="0.5"/>', "option step-length = 0.5 is not used; a tick lasts"),
         ('<time-to-teleport value="300"/>', "option time-to-teleport = 300 is not modelled"),
-        ('<seed value="5"/>', "option seed = 5 is not used: the seed of the world is"),
+        ('<seed value="5"/>', "option seed = 5 is not used; the world's own seed is used instead"),
         ('<load-state value="s.xml"/>', "option load-state = s.xml is not read"),
         ('<with-taz value="true"/>', "option device.rerouting.with-taz = true is not modelled"),
         ('<default.emergencydecel value="9"/>', "option default.emergencydecel = 9 is not"),

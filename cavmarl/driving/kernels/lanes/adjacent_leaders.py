@@ -1,4 +1,7 @@
-"""Leaders on adjacent lanes that a vehicle also covers, or that reach into the vehicle's lane."""
+"""Leaders on adjacent lanes.
+
+They are on a lane that the vehicle also covers or will cover, or they reach into its lane.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,10 @@ SWINGS_BACK_M = 3.0  # how far the rear of a 12 m bus moves back during a U-turn
 
 @inlined_kernel
 def behind_entry(kind: np.void, speed: float, gap: float, leader: np.void) -> float:
-    """Return the constraint of a leader, an ENTRY; `gap` is between the bumpers in m."""
+    """Return the constraint that a leader (ENTRY) imposes; larger is stricter.
+
+    `models/car_following_model.py` explains constraints. `gap` is between the bumpers in m.
+    """
     return behind(kind, speed, gap, leader["speed"], leader["decel"])
 
 
