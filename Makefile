@@ -114,12 +114,12 @@ ros2: $(READY) $(ROS)/.ready ## the tests of the ROS 2 bridge with rclpy of Jazz
 # Without the comment that netconvert and netgenerate begin with (date, version, options), the same
 # options give the same bytes.
 maps: $(READY) ## make the maps of all entries anew from the options beside them
-	for options in envs/*/map/*.net?cfg train/worlds/*/map/*.net?cfg; do \
+	for options in envs/*/map/*.net?cfg; do \
 	    case $$options in *.netgcfg) make=netgenerate;; *) make=netconvert;; esac; \
 	    name=$$(basename $${options%.net?cfg}).net.xml; folder=$$(dirname $$options); \
-	    (cd $$folder && $(CURDIR)/$(BIN)/$$make --configuration-file $${options##*/} --output-file $$name && \
+	    (cd $$folder && ../../../$(BIN)/$$make --configuration-file $${options##*/} --output-file $$name && \
 	    sed --in-place '2,/^-->$$/d' $$name && \
-	    case $$folder in envs/cities*|train/*) gzip --force --best --no-name $$name;; esac) || exit 1; done
+	    case $$folder in envs/cities*) gzip --force --best --no-name $$name;; esac) || exit 1; done
 
 record: $(READY) ## after a change of behaviour: golden rows, zoo, scores, generated blocks; PART=scores
 	$(BIN)/python -m tests.record $(PART)

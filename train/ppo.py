@@ -333,7 +333,9 @@ class Learner:
         if reluctant is not None:
             held = acted[reluctant[acted]]
             output = network(batch.observations.flatten(0, 2)[held]).detach()
-            chosen = torch.cat([chosen, held[is_held_back(output)]]).unique()
+            learned = torch.zeros_like(reluctant)
+            learned[chosen] = learned[held[is_held_back(output)]] = True
+            chosen = learned.nonzero().squeeze(1)
         found: list[Tensor] = []
         for _ in range(args.epochs):
             order = chosen[torch.randperm(len(chosen), device=chosen.device)]

@@ -183,6 +183,9 @@ CITIES_CARD = (
 CITIES_ALONE = f"cavmarl evaluate cities_validation -p idm {ALONE} -n 96 --seed 500"
 RESIDUAL = "cavmarl evaluate cities_validation -p cities_residual -p idm -n 96 --seed SEED"
 SEEDS = ("5000", "6000")
+SENSED = "cavmarl evaluate cities_validation -p cities_sensed -p idm -n 96 --seed 5000"
+SENSED_TEST = "cavmarl evaluate NAME -p cities_sensed -p idm -n 96 --seed 1000"
+SENSED_TESTS = ("cities_test", "cities_test_left")
 CAREFUL = "cavmarl evaluate merge -p merge_careful_ippo -p cities_ippo -p idm -n 64 --seed 2000"
 MERGE = (
     "cavmarl evaluate merge --policy merge_ippo --policy idm --policy random_actions "
@@ -330,6 +333,16 @@ def _cards() -> Iterator[ScoreTable]:
     yield ScoreTable(
         page, "scores by map", (command,), partial(maps_table, command, [*ours, *idms])
     )
+    page = "agents/cities_sensed/README.md"
+    rows = [*CITIES_ROWS, JERK]
+    yield ScoreTable(page, "scores", (SENSED,), partial(drivers_table, columns_of(SENSED), rows))
+    ours = [(name.replace("_", " "), "cities_sensed", name) for name in ("success", "collision")]
+    yield ScoreTable(page, "scores by map", (SENSED,), partial(maps_table, SENSED, [*ours, *idms]))
+    for name in SENSED_TESTS:
+        command = filled_in(SENSED_TEST, name)
+        yield ScoreTable(
+            page, name, (command,), partial(drivers_table, columns_of(command), RESIDUAL_ROWS)
+        )
     rows = [TRIPS, *shares("success", "collision", "off_road", "unfinished"), DELAY, JERK]
     yield ScoreTable(
         "agents/merge_careful_ippo/README.md",

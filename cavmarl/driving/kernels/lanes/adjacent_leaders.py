@@ -30,7 +30,7 @@ SWINGS_BACK_M = 3.0  # how far the rear of a 12 m bus moves back during a U-turn
 def behind_entry(kind: np.void, speed: float, gap: float, leader: np.void) -> float:
     """Return the constraint that a leader (ENTRY) imposes; larger is stricter.
 
-    `models/car_following_model.py` explains constraints. `gap` is between the bumpers in m.
+    The module `car_following_model` explains constraints. `gap` is between the bumpers in m.
     """
     return behind(kind, speed, gap, leader["speed"], leader["decel"])
 
