@@ -284,9 +284,15 @@ def test_history_contains_earlier_observations_and_begins_with_copies_of_the_fir
 
 
 @pytest.mark.skipif(IS_PLAIN, reason="compares no twin")
-@pytest.mark.parametrize("indicators", [False, True])
-def test_observations_in_a_divided_world_equal_the_undivided_ones(indicators: bool) -> None:
-    shown = {"sensors.conflicts.indicators": indicators, "sensors.way.stop_signs": "own"}
+@pytest.mark.parametrize(
+    "conflicts",
+    [{}, {"indicators": True}, {"indicators": True, "departs": True, "horizon_s": 8.0}],
+)
+def test_observations_in_a_divided_world_equal_the_undivided_ones(
+    conflicts: dict[str, Any],
+) -> None:
+    shown = {f"sensors.conflicts.{key}": value for key, value in conflicts.items()}
+    shown["sensors.way.stop_signs"] = "own"
     whole, divided = made(**shown), made(**shown, **{"zones.count": 4})
     rng = np.random.default_rng(1)
     one, other = whole.reset()[0], divided.reset()[0]
