@@ -1,4 +1,4 @@
-"""Speed advice and learned signals, alone and together, over the loss of messages.
+"""Speed advice and learned signals, alone and together, at several shares of lost messages.
 
 All vehicles are agents with the driver `glosa` (advice) or `idm` (no advice). Signals follow the
 map's programs, or networks that `train/signals_sb3.py` has trained with drivers `idm` or, for the
@@ -27,7 +27,7 @@ from cavmarl.core.errors import CavmarlError, ConfigError
 from cavmarl.evaluate.statistics import mean_interval
 
 TRAINING = Path(__file__).parent.parent / "train" / "signals_sb3.py"
-# Ticks are 0.2 s. Only signals send.
+# A tick takes 0.2 s. Only roadside units at signals send messages.
 CONNECTED = ADVISED | {
     "v2x.cam.rate_hz": 0.0,
     "v2x.denm.rate_hz": 0.0,

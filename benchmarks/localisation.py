@@ -73,7 +73,10 @@ def measure(
         columns[f"{short} mean"] = f"{stage}_mean_m:.3f"
         columns[f"{short} 95 %"] = f"{stage}_p95_m:.3f"
     columns |= {"used": "matched", "refused": "refused", "ms": "step_ms:.1f"}
-    notes = ["GNSS: mean error of its fixes; used, refused: scans; ms: processor time per step"]
+    notes = [
+        "GNSS: length of the mean error of the fixes; used, refused: numbers of scans; "
+        "ms: processor time per step"
+    ]
     title = f"position error, m: GNSS {noise:g} m of noise, {bias:g} m of bias"
     return BenchmarkReport(title + ("" if markings else ", no lane markings"), columns, rows, notes)
 

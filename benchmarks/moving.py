@@ -128,8 +128,8 @@ def _report(
         },
         rows,
         notes=[
-            f"moving over fixed: {ratio:.2f}, by the busiest worker's processor time "
-            f"{processor_ratio:.2f}; the same states"
+            f"speedup by moving: {ratio:.2f}; by the busiest worker's processor time: "
+            f"{processor_ratio:.2f}; both sides have the same states"
         ],
         facts={
             "ratio": ratio,

@@ -69,9 +69,9 @@ def measure(
         rows,
         notes=[
             "tick, wall: mean wall time of a tick; tick, processor: mean processor time of "
-            "the caller and all nodes together; tick, least: wall time of a lower bound, measured "
-            "in turn with the others: the same number of messages and processes, which only "
-            "run the phases of the same world, undivided; zones stand still: from "
+            "the caller and all nodes together; tick, least: lower bound of the wall time, "
+            "measured in turn with the other times: as many processes exchange as many messages, "
+            "and each process runs the same world undivided; zones stand still: time from "
             "SIGKILL to the end of the caller's current or next step",
         ],
     )
@@ -127,7 +127,10 @@ def _empty_ticks(env: str, nodes: int, turns: int) -> list[dict[str, Any]]:
 
 
 class _Least:
-    """Processes that only exchange the messages of empty ticks; this process is the caller."""
+    """Processes that run an undivided world and exchange messages as nodes do in empty ticks.
+
+    This process is the caller.
+    """
 
     def __init__(self, env: str, nodes: int, ticks_per_step: int) -> None:
         with socket.create_server((LOCAL, 0)) as listener:

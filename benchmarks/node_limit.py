@@ -41,7 +41,7 @@ def measure(
             sides = {
                 f"{vehicles:,} vehicles": worlds[:1],
                 f"{vehicles // 2:,} vehicles": worlds[1:2],
-                f"twice {vehicles // 2:,} at once": worlds[1:],
+                f"2 worlds of {vehicles // 2:,} at once": worlds[1:],
             }
             found: dict[str, list[tuple[float, float]]] = {name: [] for name in sides}
             for number in range(repeats):

@@ -83,9 +83,10 @@ def measure(
         },
         rows,
         notes=[
-            "ms: median tick; + ms: latency added to each connection; faster: than undivided, "
-            "by adjacent turns, with an interval of 95 %; MB: resident memory of the "
-            "largest process; the models are fitted to runs with at most 2 nodes",
+            "ms: median tick; + ms: latency added to each connection; faster: speedup over the "
+            "undivided world in adjacent turns, ± its 95 % interval; off: model / measured - 1; "
+            "MB: resident memory of the largest process; share: of the undivided world's memory; "
+            "the models are fitted to runs with at most 2 nodes",
             *_predictions(costs, max(cores, max(OVER))),
         ],
         facts={

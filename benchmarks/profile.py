@@ -63,7 +63,7 @@ def measure(
         ],
         notes=[
             f"sum: {timed_ns:,.0f} ns; a step without stopwatches: {plain_ns:,.0f} ns per vehicle; "
-            f"the phases sum to {timed_ns / plain_ns - 1.0:+.1%} of that"
+            f"the sum of the phases differs from that by {timed_ns / plain_ns - 1.0:+.1%}"
         ],
         facts={
             "vehicles": vehicles,

@@ -69,8 +69,8 @@ def measure(
         },
         rows,
         notes=[
-            f"re-cut over static, fullest zone over mean: {ratios.mean():.2f}{between}; the same "
-            "states"
+            f"imbalance (fullest zone / mean) of re-cut / static: {ratios.mean():.2f}{between}; "
+            "both worlds have the same states"
         ],
         facts={
             "vehicles": mean,

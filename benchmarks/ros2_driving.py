@@ -78,7 +78,7 @@ def measure(
             + ", ".join(f"{count} {name}" for name, count in counts.items()),
             f"commands: {used['used']} used, {used['late']} late, {used['invalid']} invalid; "
             f"{found['steps_per_s']:.0f} steps/s of the wall clock",
-            "the stand-in's acceleration was limited by, in steps: "
+            "steps by the reason that limited the stand-in's acceleration: "
             + ", ".join(f"{name} {count}" for name, count in found["reasons"].items()),
             "no Autoware was run",
         ],

@@ -59,7 +59,7 @@ def divided(steps: int, seed: int) -> tuple[Found, Found]:
             same == steps,
         ),
         Found(
-            f"{transfers} in {steps} steps; of {owners} vehicles none duplicated or lost",
+            f"{transfers} in {steps} steps; no duplicate or loss among {owners} vehicles",
             transfers > 0 and once and same == steps,
         ),
     )
@@ -72,7 +72,7 @@ def placed() -> Found:
     found = select(fleet)
     out = len(found.rejections)
     return Found(
-        f"{out} workers above a threshold left out; of 2 others the less loaded one",
+        f"{out} workers above a threshold excluded; the less loaded of 2 others chosen",
         out == len(THRESHOLDS) and found.worker == 4,
     )
 

@@ -76,7 +76,7 @@ def measure(
         {
             "weights": "weights",
             "other choice": "changed:.2f",
-            "its score above the best, mean": "regret:.3f",
+            "its score minus the best, mean": "regret:.3f",
         },
         rows,
         notes=[f"one choice of {MANY} workers: {timed}"],

@@ -97,7 +97,8 @@ def scaling_table(
     for one in measured:
         if not (0.0 < one.step_ms < math.inf and 0.0 <= one.wait_ms <= one.step_ms):
             raise ConfigError(
-                f"{one.workers} sensor workers: {one.wait_ms:g} ms of {one.step_ms:g} ms is wrong"
+                f"{one.workers} sensor workers: waited {one.wait_ms:g} ms in a step of "
+                f"{one.step_ms:g} ms: must be from 0 to the time of the step"
             )
     rounded: Callable[[float], float] = _to_two_places if paper_rounding else float
     best = min(measured, key=lambda one: one.step_ms)

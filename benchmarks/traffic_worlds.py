@@ -54,14 +54,14 @@ def measure(
     sound_rows = _shares(sound)
     return BenchmarkReport(
         _title(found),
-        {"over SUMO's mean, less 1": "figure", **{head: head for head in _SHARES}},
+        {"deviation from SUMO's mean": "figure", **{head: head for head in _SHARES}},
         _shares(found),
         facts={"summary": found, "sound": sound, "features": parts, "worlds": rows},
         caption=_caption(found),
         tables=(
             make_table(
                 f"{_title(sound)}, without {', '.join(sorted(MAP_FEATURES))}",
-                ("over SUMO's mean, less 1", *_SHARES),
+                ("deviation from SUMO's mean", *_SHARES),
                 [[row["figure"], *(row[head] for head in _SHARES)] for row in sound_rows],
                 _caption(sound),
             ),

@@ -31,8 +31,8 @@ def measure(
     low, middle, high, highest = found.barrier_us
     notes = [
         f"{count} workers over one: [bold]{found.ratio:.2f}[/], by the busiest one's processor "
-        f"time {found.processor_ratio:.2f}; one worker costs {found.cost_of_one:.2f} times the "
-        "step without",
+        f"time {found.processor_ratio:.2f}; a step with one worker takes {found.cost_of_one:.2f} "
+        "times as long as without workers",
         f"an empty command to all {count}: [bold]{middle:.1f}[/] µs "
         f"({low:.1f} / {high:.1f} / {highest:.1f}: 5, 95, 99 %); idle workers take "
         f"{found.idle_s:.1%} of a core",

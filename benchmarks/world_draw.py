@@ -139,7 +139,7 @@ class _Chance:
         self.features: list[str] = []
 
     def one_of(self, shares: dict[str, float]) -> str:
-        """Draw one of the features that are not excluded, by their shares."""
+        """Draw one of the features that are not excluded; their shares are the probabilities."""
         left = {name: share for name, share in shares.items() if name not in self._without}
         if not left:
             raise ConfigError(f"--without: excludes all of {', '.join(shares)}; exclude fewer")

@@ -105,7 +105,9 @@ class _Contraflow:
         self.connections = [element for name in roads for element in self._connections(name)]
 
     def controlled(self, signals: Element) -> Iterable[Element]:
-        """Yield the movements that a signal controls, with the letters of the adjacent movements.
+        """Yield the contraflow movements that a signal controls.
+
+        Each has the signal and the link index of the movement beside it on the map's own roads.
 
         `signals`: the root of a file of signals.
         """
@@ -123,7 +125,7 @@ class _Contraflow:
             yield Element("connection", dict(one.items()) | words)
 
     def _beside(self, name: str) -> str:
-        """Return the map's own road in the direction of contraflow lanes; without one, `name`."""
+        """Return the map's own road in the direction of contraflow lanes, or `name` if none."""
         road = next(
             (edge for key, edge in self._reverses.items() if contraflow_of(key) == name), None
         )

@@ -46,7 +46,7 @@ def shared_ground(network: RoadNetwork) -> list[tuple[int, int]]:
 
 
 def touching_roads(network: RoadNetwork) -> list[tuple[int, int]]:
-    """Return one pair of `shared_ground`, open to cars, for each two roads or junctions."""
+    """Return one pair of `shared_ground` for any two roads or junctions, if it is open to cars."""
     cars = network.lanes["permissions"] & CARS != 0
     owners = _owners(network)
     found: dict[Any, tuple[int, int]] = {}

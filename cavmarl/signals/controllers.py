@@ -228,7 +228,7 @@ def _keeps(view: SignalView) -> NDArray[np.bool_]:
 
 
 def _choices(view: SignalView, wanted: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the choices for wanted greens (W, S) that are allowed."""
+    """Return the choices that lead to the wanted greens (W, S), or allowed choices instead."""
     green = view.states[..., GREEN]
     if view.config.action == "next_phase":
         choices, keep = wanted, green

@@ -25,10 +25,10 @@ GREEN_FEATURES = (
     "vehicles",  # / 10
     "standing",  # / 10
     "slowed",  # sum of 1 - speed / desired speed, / 10
-    "most_vehicles",  # on a lane, / 10
-    "most_standing",  # on a lane, / 10
+    "most_vehicles",  # largest number on one lane, / 10
+    "most_standing",  # largest number on one lane, / 10
     "waited",  # sum of the times that vehicles have been stopped, / 200 s
-    "most_waited",  # on a lane, / 200 s
+    "most_waited",  # largest sum on one lane, / 200 s
     "pressure",  # see `SignalTable`, / 10
     "behind",  # vehicles on the outgoing lanes, / 20
     "standing_behind",  # stopped vehicles on the outgoing lanes, / 10

@@ -56,7 +56,7 @@ PLACED_SHARE = 0.75  # share of the origin lanes that placed agents may occupy; 
 
 
 class TrafficCalls:
-    """Bound kernel calls for the departures of some worlds.
+    """The kernel calls for the departures of some worlds, with their arguments.
 
     Attributes:
         running: (W,) vehicles of each world in all zones; read by `accept`.

@@ -115,7 +115,10 @@ def _lines(
 
 
 def _largest_part(network: RoadNetwork) -> tuple[list[list[int]], NDArray[np.int64]]:
-    """Return the predecessors of each edge, and the edges of the part with the longest lanes."""
+    """Return the predecessors of each edge, and the edges of the largest connected part.
+
+    The largest part is the part in which the lanes have the largest total length.
+    """
     lanes, links = network.lanes, network.links
     usable = lanes["permissions"] & CARS != 0
     good = (

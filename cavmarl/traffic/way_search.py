@@ -166,7 +166,7 @@ class WaySearch:
     def _own_s(self, roads: RoadArrays, row: np.void, permission: int) -> float:
         """Return the time in s on the vehicle's present lane if the caller has closed it, else 0.
 
-        A vehicle on a closed lane leaves it.
+        Plans add a long wait for closed lanes, but a vehicle that is on a closed lane drives on.
         """
         lane = int(row["lane"])
         if int(self._traffic.lanes["permissions"][lane]) & permission:

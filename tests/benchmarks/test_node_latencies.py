@@ -32,7 +32,7 @@ def test_a_city_its_half_and_two_halves_at_once_are_measured() -> None:
     assert [row["world"] for row in found.rows] == [
         f"{least:,} vehicles",
         f"{least // 2:,} vehicles",
-        f"twice {least // 2:,} at once",
+        f"2 worlds of {least // 2:,} at once",
     ]
     assert found.rows[0]["faster"] == 1.0
     assert all(row["cpu_ms"] > 0.0 for row in found.rows)

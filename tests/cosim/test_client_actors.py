@@ -299,7 +299,7 @@ def test_a_world_without_places_for_actors_names_the_setting(address: Path) -> N
     [
         ({"own": [PoseView(1e3, 0.0, 0.0, 0.0)]}, "is in the future"),
         ({"own": [PoseView(0.0, math.nan, 0.0, 0.0)]}, "x = nan"),
-        ({"other": [PoseView(0.0, 0.0, 0.0, 0.0)]}, "poses of other, not its actor"),
+        ({"other": [PoseView(0.0, 0.0, 0.0, 0.0)]}, "poses of other, which is not its actor"),
     ],
 )
 def test_a_client_with_invalid_poses_is_dropped_with_its_actor(

@@ -168,8 +168,8 @@ class ClientActors:
         """
         if actor.order.moved_by != POSES:
             raise ActionError(
-                f"a pose of '{actor.name}', which is moved by {actor.order.moved_by}; ask for "
-                "moved_by = poses"
+                f"'{actor.name}' takes no poses, because it is moved by {actor.order.moved_by}; "
+                "request the actor with moved_by = poses"
             )
         actor.track.add(sample, now_s, self._env.step_s)
 
@@ -185,8 +185,8 @@ class ClientActors:
         """
         if actor.order.moved_by != CONTROLS:
             raise ActionError(
-                f"controls of '{actor.name}', which is moved by {actor.order.moved_by}; ask for "
-                "moved_by = controls"
+                f"'{actor.name}' takes no controls, because it is moved by {actor.order.moved_by}; "
+                "request the actor with moved_by = controls"
             )
         given = np.asarray(controls, dtype=np.float64)
         if given.shape != (2,) or not (np.abs(given) <= 1.0).all():

@@ -178,8 +178,8 @@ class _Played:
 class TracePlayer:
     """Plays traces in an environment, in each episode from its start.
 
-    A body enters in the step of its first pose, or when its place is free. It leaves after its last
-    pose.
+    A body enters in the step of its first pose; if its place is occupied, it enters as soon as the
+    place is free. It leaves after its last pose.
 
     Args:
         actors: the actors of the environment.

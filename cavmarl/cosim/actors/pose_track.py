@@ -40,8 +40,8 @@ class PoseCounts:
     """Counts of the poses of a track."""
 
     received: int = 0
-    # poses that arrived after a newer pose and were dropped, or that were used but more than one
-    # period (1 / `rate_hz`) plus one step old on arrival
+    # poses that arrived after a newer pose (these are dropped), and poses that were more than one
+    # period (1 / `rate_hz`) plus one step old on arrival (these are used)
     late: int = 0
     lost: int = 0  # poses missing between two poses at the given rate
     extrapolated: int = 0  # steps without a pose for the end of the step

@@ -125,7 +125,7 @@ class ActorTable:
     """The actors of one episode, and their states as records of a snapshot.
 
     `first_number`: number of the first actor, larger than all numbers of earlier episodes, because
-    clients remember actors by their numbers. `next_number`: lower bound of the numbers of vehicles.
+    clients remember actors by their numbers. `next_number`: smallest number of a vehicle.
     `known`: actors, by vehicle id, that keep their numbers when these vehicles appear.
     """
 
@@ -157,7 +157,7 @@ class ActorTable:
         return self._next
 
     def skip_to(self, number: int) -> None:
-        """Number the next actors from this number on, or from a higher number."""
+        """Do not give new actors numbers below this number."""
         self._next = max(self._next, number)
 
     @property

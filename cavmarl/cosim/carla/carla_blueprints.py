@@ -281,7 +281,7 @@ _PROPS = {
     "warningconstruction": (0.4, 0.8, 0.9),
     "wateringcan": (0.4, 0.2, 0.3),
 }
-_CHILDREN = (9, 10, 11, 12, 13, 14, 48, 49)  # numbers of walkers
+_CHILDREN = (9, 10, 11, 12, 13, 14, 48, 49)  # numbers of the walkers that are children
 # Programs look these up, but cavmarl's server refuses to spawn them.
 _OTHER_CAMERAS = (
     "camera.normals",

@@ -1,8 +1,8 @@
 """CARLA's frame: x east, y south, z up, left-handed; yaw clockwise seen from above, in degrees.
 
 Pitch is positive upwards, roll is positive with the right side down. Rotations are applied in the
-order roll, pitch, yaw, as CARLA's transforms returns them. Angles of records of cavmarl
-are in rad, counter-clockwise, in a right-handed frame with y north.
+order roll, pitch, yaw, as in CARLA's transforms. Angles in cavmarl's records are in rad,
+counter-clockwise, in a right-handed frame with y north.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def _pose_of(place: Matrix, axes: Matrix) -> CarlaPose:
 
 
 def mount_in_vehicle(pose: CarlaPose) -> Matrix:
-    """Return the (3, 4) mount of `sensors.kernels` of a pose relative to a vehicle.
+    """Return a pose relative to a vehicle as a (3, 4) mount for the kernels of sensors.
 
     Its columns are the axes ahead, left and up, and the place, in the vehicle's right-handed frame.
     """

@@ -35,7 +35,7 @@ from cavmarl.maps.components import strong_components
 from cavmarl.roads.network import CARS, SIGNAL_STATES, RoadNetwork
 from cavmarl.roads.shown_signals import signal_codes
 
-RED, YELLOW, GREEN, OFF = 0, 1, 2, 3  # CARLA's numbers of states of traffic lights, strict first
+RED, YELLOW, GREEN, OFF = 0, 1, 2, 3  # CARLA's states of traffic lights, the strictest first
 
 _STATE_OF_CODE = np.zeros(len(SIGNAL_STATES), np.uint8)
 _STATE_OF_CODE[[SIGNAL_RED, SIGNAL_RED_YELLOW, SIGNAL_STOP_THEN_GO]] = RED

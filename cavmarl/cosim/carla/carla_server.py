@@ -231,7 +231,7 @@ class CarlaServer:
     async def _keep_time(
         self, loop: asyncio.AbstractEventLoop, is_over: Callable[[], bool]
     ) -> None:
-        """Tick by the wall clock while no client does."""
+        """Tick by the wall clock, except in synchronous mode, in which clients tick."""
         session = self.session
         due_s = loop.time()
         while not is_over():

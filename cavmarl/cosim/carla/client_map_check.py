@@ -49,7 +49,7 @@ _LIGHT_AHEAD_M = 30.0
 
 
 class Deviation(NamedTuple):
-    """Differences of poses: 95 % are below the first value, all are at most the second."""
+    """Differences of poses: 95 % are at most `usual`, and all are at most `largest`."""
 
     usual: float
     largest: float

@@ -15,7 +15,7 @@ from cavmarl.cosim.carla.sensor_settings import SensorContext
 
 _SKY_M = 1e6  # depth of pixels without an object, which move only if the camera turns
 _LARGEST = 2.0  # largest absolute flow, as in CARLA
-_NEAR_M = 0.01  # points that were closer to the plane of the last picture have the largest flow
+_NEAR_M = 0.01  # points nearer to the camera, or behind it, count as at this distance ahead
 
 Floats = NDArray[np.float64]
 

@@ -148,7 +148,7 @@ def _cut(head: str, lines: Iterator[str]) -> str:
 
 
 def _frame_lines(recording: CarlaRecording, show_all: bool) -> Iterator[str]:
-    """Yield when actors appear and leave; with `show_all`, also their places by frame, in cm."""
+    """Yield lines about actors that appear or leave; `show_all`: also all places, in cm."""
     actors = recording.session.actors
     present: set[int] = set()
     for frame_number, (time_s, frame) in enumerate(recording.moments(), start=1):

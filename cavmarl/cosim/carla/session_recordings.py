@@ -126,7 +126,7 @@ class SessionRecordings:
     def end_replay(self, only_if_over: bool = False) -> None:
         """Show the world again, if a recording is being shown.
 
-        `only_if_over`: continue a recording that has not reached its end.
+        `only_if_over`: if the recording has not reached its end, keep showing it.
         """
         session = self._session
         replay = session.world.replay

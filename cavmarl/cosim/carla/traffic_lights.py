@@ -34,7 +34,7 @@ _GREEN_MINOR = SIGNAL_STATES.index("g")
 
 @dataclass
 class _Group:
-    """The phase of a signal that clients time. Phases are numbered from the first of a program."""
+    """The phases of a signal whose times clients set, numbered from the first one of a program."""
 
     first: int  # PHASE row
     following: list[int]  # next phase of each phase

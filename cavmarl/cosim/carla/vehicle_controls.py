@@ -16,7 +16,7 @@ THROTTLE_MPS2 = 4.5  # acceleration at throttle = 1
 BRAKE_MPS2 = 8.0  # deceleration at brake = 1
 _ROLLING_MPS2 = 0.2  # deceleration without throttle, and its increase per m/s
 _DRAG_PER_S = 0.02
-_LARGEST_SINE = 0.99  # of the slip angle
+_LARGEST_SINE = 0.99  # largest sine of the slip angle
 _STANDING_MPS = 0.01
 _ACKERMANN_PER_S = 2.0  # acceleration per m/s of difference to the target speed
 
@@ -112,7 +112,7 @@ def same_turn(angle_rad: float, times_wheelbase: float) -> float:
     """Return the wheel angle that turns a longer vehicle as fast as `angle_rad` turns this vehicle.
 
     The vehicles are kinematic bicycles, see `driving.kernels.motion.bicycle`. The result is below a
-    right angle; a longer vehicle cannot follow each turn.
+    right angle, so a longer vehicle cannot make every turn.
     """
     slip = math.atan(0.5 * math.tan(angle_rad))
     sine = min(max(times_wheelbase * math.sin(slip), -_LARGEST_SINE), _LARGEST_SINE)

@@ -259,7 +259,9 @@ class Barrier:
         now_s = moment.tick * self._env.config.clock.sim_dt_s
         for name, views in poses.items():
             if name not in actors:
-                raise FollowerError(f"{seat.line.name}: poses of {name[:80]}, not its actor")
+                raise FollowerError(
+                    f"{seat.line.name} sent poses of {name[:80]}, which is not its actor"
+                )
             if len(views) > MAX_POSES:
                 raise FollowerError(
                     f"{seat.line.name}: {len(views)} poses of {name} in a message; the limit is "

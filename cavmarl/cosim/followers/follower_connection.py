@@ -231,7 +231,8 @@ def _size(view: ArrayView) -> int:
         raise FollowerError(f"{name}: invalid shape {str(shape)[:80]}")
     if not len(view.stamps_s) == len(view.lost) == shape[0]:
         raise FollowerError(
-            f"{name}: {shape[0]} samples with {len(view.stamps_s)} stamps, {len(view.lost)} marks"
+            f"{name}: {shape[0]} samples with {len(view.stamps_s)} stamps and {len(view.lost)} "
+            "flags `lost`; give one of each per sample"
         )
     return prod(shape) * np.dtype(view.dtype).itemsize
 

@@ -123,7 +123,7 @@ class Welcome:
     tick: StrictInt  # the master's current tick
     dt_s: StrictFloat
     ticks_per_step: StrictInt  # ticks from one snapshot to the next
-    # ticks by which the vehicle delays controls after the start of their step
+    # ticks from the start of a step until the vehicle applies the controls of this step
     control_latency_ticks: StrictInt
     action: StrictStr  # `continuous`, `discrete` or `grid`
     acceleration_mps2: StrictFloat  # acceleration if the first control is 1
@@ -223,8 +223,8 @@ class Control:
     """The answer to a snapshot."""
 
     frame: StrictInt  # frame of the snapshot
-    # by vehicle or actor. Vehicles: two numbers in [-1, 1], or the number of a meta-action. Actors
-    # that are moved by controls: two numbers in [-1, 1]; the last controls are kept until new ones
+    # by vehicle or actor. A vehicle gets two numbers in [-1, 1], or the number of a meta-action. An
+    # actor that is moved by controls gets two numbers in [-1, 1], and keeps them until new controls
     controls: dict[StrictStr, list[StrictFloat] | StrictInt]
     poses: dict[StrictStr, list[PoseView]] = field(default_factory=dict)  # as in `ActorPoses`
 

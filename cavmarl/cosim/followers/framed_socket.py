@@ -50,7 +50,7 @@ class Frame(NamedTuple):
     """A received frame without its data."""
 
     kind: IntEnum  # kind of the frame
-    order: int  # free number; messages of followers have 0
+    order: int  # a number that each dialect uses as it likes; messages of followers have 0
     payload: Any  # as decoded by the dialect; None: empty
     size: int  # size of the data in bytes
     checksum: int  # checksum of the data

@@ -257,8 +257,8 @@ class RosBridge:
             if (topic, kind) not in self._mismatches:
                 self._mismatches.add((topic, kind))
                 log.warning(
-                    "%s: a node uses this topic with the type %s, but its type is %s; they are not "
-                    "connected: use the type of the bridge, or another topic",
+                    "%s: a node uses this topic with the type %s, but the bridge uses %s; node and "
+                    "bridge are not connected: use the type of the bridge, or another topic",
                     topic,
                     kind,
                     self._node.kind_of(topic),

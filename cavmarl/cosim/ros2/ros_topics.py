@@ -336,8 +336,8 @@ class WorldTopics:
         for vehicle in vehicles:
             if taken := sorted(self.kinds.keys() & vehicle.kinds.keys()):
                 raise ConfigError(
-                    f"{taken[0]} of {vehicle.vehicle} is used by another message; use one "
-                    "vehicle with the profile autoware, and other names of sensors"
+                    f"{taken[0]} of {vehicle.vehicle} is used by another message; give the sensors "
+                    "other names or, with the profile autoware, use a single vehicle"
                 )
             self.kinds |= vehicle.kinds
         self._mounted: dict[str, float] = {}  # vehicle → wheelbase of its current transforms
@@ -362,7 +362,9 @@ class WorldTopics:
         return self._present(view) != self._begun
 
     def messages(self, view: FollowerView, wanted: frozenset[str]) -> Iterator[RosMessage]:
-        """Yield the wanted messages of a noticed snapshot, in a fixed order; the clock comes last.
+        """Yield the wanted messages of a snapshot, in a fixed order; the clock comes last.
+
+        Call `notice` with the snapshot first.
 
         Latched messages are included when they have changed, whether they are wanted or not.
         """

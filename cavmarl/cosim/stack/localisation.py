@@ -121,7 +121,7 @@ class GnssInertial:
         return self._state
 
     def _newest(self, readings: Readings, kind: str) -> NDArray[np.float64] | None:
-        """Return the newest sample of a type of sensor that was not lost."""
+        """Return the newest sample of a type of sensor, without lost samples; None: no sample."""
         samples = self._samples(readings, kind)
         if samples is None or samples.lost.all():
             return None

@@ -30,7 +30,7 @@ from cavmarl.roads.routing import make_plans
 
 _AHEAD_M = 70.0
 _MATCH_M = 5.0
-_HEADING_COST_M = 3.0  # lateral distance from a lane that counts like a radian of heading
+_HEADING_COST_M = 3.0  # 1 rad between vehicle and lane counts like this lateral distance
 _EXPECTED_M = 1.5  # preference for a lane on the previous route
 _ACCEL, _DECEL, _HEADWAY_S, _GAP_M = 1.5, 2.5, 1.4, 2.0  # of the IDM; accelerations in m/s²
 _HARDEST = 6.0  # maximum braking, m/s²

@@ -36,7 +36,7 @@ _RANGE_M = 50.0  # maximum range of used echoes
 _LOWEST_M, _HIGHEST_M = 0.3, 4.0  # heights above the road that exclude ground and treetops
 _UPRIGHT = 0.5  # maximum vertical part of a wall's normal
 _AROUND_M = 60.0  # extent of the map around a scan
-_EXTRUDED_M = (-0.2, 0.0, 0.2)  # copies of a single-layer scan, as for upright walls
+_EXTRUDED_M = (-0.2, 0.0, 0.2)  # a single-layer scan is copied to these heights: walls are upright
 _GATE = 16.0  # squared Mahalanobis distance from the filter's pose beyond which a match is rejected
 _GATE_M = 1.5  # the echo of a pair farther apart belongs to an object that the map lacks
 _PAIR_M = 0.4  # pairs nearer than this are used for the pose
@@ -49,13 +49,17 @@ _WEAKEST = 1e-3  # share of the best axis's information below which an axis is i
 _LEAST_M = 0.1
 _BIAS_M, _BIAS_DRIFT_M = 3.0, 0.02  # deviation of the fixes' bias, and its drift per second
 _SURE_M = 0.5  # standard deviation below which a scan is tried only at the estimated position
-_SIGMAS, _STEPS = 2.5, 6  # otherwise: radius of the search in deviations, steps to each side
+# If the deviation is larger, a scan is also tried within _SIGMAS deviations of the estimated
+# position, in _STEPS steps to each side.
+_SIGMAS, _STEPS = 2.5, 6
 _TRIED, _TRY_EVERY = 150, 5  # echoes used per try, and scans between tries
 _FIRST_TRIED = 3  # number of best places that are then matched fully
 _FAR_COST = 0.05  # penalty at the edge of the tried area, as a share of fitting echoes
 _LOST_SCANS = 20  # consecutive scans without a fit after which the position is unknown
-_ASIDE_M, _WORSE = 0.5, 3.0  # a fit slides unless a shift by _ASIDE_M makes it worse by _WORSE
-_TURN_M = 10.0  # distance that counts like a radian of heading
+# A fit determines the position along an axis only if shifts by _ASIDE_M to both sides lower its log
+# likelihood by at least _WORSE.
+_ASIDE_M, _WORSE = 0.5, 3.0
+_TURN_M = 10.0  # an error of 1 rad in the heading counts like an error of this distance
 
 
 class ScanMatching(GnssInertial):

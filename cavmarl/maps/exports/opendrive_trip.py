@@ -56,7 +56,7 @@ class RoundTrip:
         if not fewest <= self.read.links <= self.map.links:
             found.append(f"links {self.map.links} in the map, {self.read.links} read by netconvert")
         if self.off > MOST_OFF:
-            found.append(f"the total length of roads in the file differs by {self.off:.1%}")
+            found.append(f"total length of roads: the file differs from the map by {self.off:.1%}")
         return found
 
     @property

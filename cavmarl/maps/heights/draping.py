@@ -43,7 +43,7 @@ class HeightReport:
     void_cells: int  # cells of the models around the map without a height
     raised_edges: tuple[str, ...]  # edges partly or completely on bridges or in tunnels
     crossings: int  # crossings of lanes on two levels
-    ramp_places: int  # ground places whose height differs from the model's for a clearance
+    ramp_places: int  # places on the ground that were raised or lowered at crossings
     smoothed_places: int  # places whose height differs from the model's to limit the grade
     most_smoothed_m: float
     max_grade: float  # steepest grade of the result

@@ -55,7 +55,7 @@ def _between(places: Points, ends: Points) -> NDArray[np.bool_]:
 
 
 def _spread_to_junctions(stations: Stations, levels: Levels) -> None:
-    """Give a junction and its lanes the level of the lanes that meet there, if it is the same."""
+    """Give a junction and its lanes the level of the lanes that meet there, if all share it."""
     base = int(stations.first[-1])
     ends: dict[int, set[int]] = {}
     around: dict[int, set[int]] = {}

@@ -14,7 +14,9 @@ from cavmarl.maps.heights.profile_graph import ProfileGraph
 from cavmarl.maps.net_document import DocumentLane, NetDocument, Points
 
 STEP_M = 1.0
-_BESIDE = 40  # adjacent places are searched within this many places of the proportional one
+# The place beside a place is searched on the neighbouring lane, up to this many places away from
+# the place at the same share of the lane.
+_BESIDE = 40
 _OFF_M = 0.01  # maximum error of written heights
 
 Rows = NDArray[np.int64]

@@ -349,7 +349,9 @@ def _scene(
     if twice := [name for name, number in Counter(names).items() if number > 1]:
         raise MapError(f"two tracks are named '{twice[0][:80]}': ids must be unique")
     if not tracks:
-        raise MapError("no track of a vehicle, pedestrian or cyclist is ever valid: nothing to do")
+        raise MapError(
+            "no track of a vehicle, pedestrian or cyclist is ever valid: export a scene with tracks"
+        )
     if not lanes:
         raise MapError(
             "no lane for motor vehicles: export the scene with the centre lines of its lanes"

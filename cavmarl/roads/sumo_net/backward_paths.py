@@ -26,8 +26,9 @@ from cavmarl.roads.polylines import (
     without_repeats,
 )
 
-# A car cannot follow a path that has a corner above KINK_RAD and turns ASTRAY_RAD more than its
-# roads do, or a path with a corner above BACK_RAD between roads that make no U-turn of U_TURN_RAD.
+# A car cannot follow a path in two cases. (1) The path has a corner above KINK_RAD, and it turns
+# ASTRAY_RAD more than its roads do. (2) The path has a corner above BACK_RAD, but its roads make no
+# U-turn (a turn above U_TURN_RAD).
 KINK_RAD = np.radians(60.0)
 ASTRAY_RAD = np.radians(90.0)
 BACK_RAD = np.radians(100.0)

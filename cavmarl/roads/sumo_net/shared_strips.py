@@ -88,7 +88,8 @@ def move_apart(
             continue
         start, end = shapes[way.before][-1], shapes[way.after][0]
         if len(way.inside) == 1 and hypot_all(*(end - start)[:2]) < SHORT_M:
-            # If this line has sharp corners, `mend_backward_paths` makes room for a curve.
+            # The new path is a straight line. If it has sharp corners with the lanes,
+            # `mend_backward_paths` makes room for a curve.
             shapes[way.inside[0]] = without_repeats(np.stack([start, end]))
         else:
             redraw(shapes, way)
@@ -148,7 +149,8 @@ def _beside(shape: Shape, left_m: float) -> Shape:
     normals = np.stack([-steps[:, 1], steps[:, 0]], axis=1)
     before, after = normals[[0, *range(len(normals))]], normals[[*range(len(normals)), -1]]
     middle = before + after
-    # Twice the squared cosine of half the turn: the parallels of both segments meet there.
+    # `square` is twice the squared cosine of half the turn: the parallels of both segments meet at
+    # the offset `left_m * middle / square` from the corner.
     square = np.maximum((middle * before).sum(axis=1), 2.0 / MOST_MITER**2)
     moved = shape.copy()
     moved[:, :2] += left_m * middle / square[:, None]

@@ -112,7 +112,7 @@ class _CheckedReader(ContentHandler):
             for key in ("response", "foes"):
                 if not _BITS.fullmatch(attrs[key]):
                     raise self._error(
-                        name, attrs, f"has {key}='{attrs[key]}', must be only 0 and 1"
+                        name, attrs, f"has {key}='{attrs[key]}', must contain only 0 and 1"
                     )
 
     def _read_rules(self, name: str, attrs: Mapping[str, str]) -> None:

@@ -208,7 +208,7 @@ def _areas(found: Range, half_m: float, foe_half_m: float) -> tuple[Area, Area] 
 
 
 def _begin_m(link: np.void, enter_m: float) -> float:
-    """Return the start of a conflict's area, moved behind a front at its waiting position."""
+    """Return the start of a conflict's area; it is ahead of a front at the waiting position."""
     waits = enter_m >= link["wait_m"] - LINE_MARGIN_M
     return float(max(enter_m, link["wait_m"] + WAIT_SLACK_M + STEP_M if waits else 0.0))
 

@@ -51,7 +51,7 @@ def lidar_directions(
 
 
 def has_echo(distances_m: Floats, range_m: float) -> NDArray[np.bool_]:
-    """Return for each distance whether its ray has hit something; else it is `range_m`."""
+    """Return for each distance whether its ray has a hit; without a hit, it is `range_m`."""
     return distances_m < range_m - ECHO_MARGIN_M
 
 

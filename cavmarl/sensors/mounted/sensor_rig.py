@@ -35,7 +35,7 @@ class Turn(NamedTuple):
 
 
 Sense: TypeAlias = Callable[[Sequence[SensedScene], Sequence[Turn]], None]
-"""Writes the samples of all turns, as `MountedSensor.sense` does, before it returns."""
+"""Writes the samples of the given sensors, as `MountedSensor.sense` does, before it returns."""
 
 
 def sense_here(scenes: Sequence[SensedScene], turns: Sequence[Turn]) -> None:

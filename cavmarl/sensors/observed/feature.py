@@ -69,7 +69,7 @@ class Reading:
 
 
 def hidden(through_walls: bool) -> str:
-    """Return what hides vehicles from a sensor that vehicles do not block."""
+    """Return what hides vehicles from a sensor that sees through other vehicles."""
     if through_walls:
         return "neither buildings nor vehicles hide them"
     return "buildings hide them, vehicles do not"

@@ -263,7 +263,7 @@ class DefinitionCollector:
         depart = self._begin_ms if start == "begin" else element.time_ms("depart")
         latest = self._latest_ms.get(element.path, 0)
         if depart < latest:
-            what = "vehicle departs before a vehicle above it: sorted (SUMO drops it)"
+            what = "vehicle departs before one that precedes it in the file: sorted (SUMO drops it)"
             self.report.tolerate(what, element.place)
         self._latest_ms[element.path] = max(latest, depart)
         return single_timing(depart)

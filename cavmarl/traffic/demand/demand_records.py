@@ -20,7 +20,7 @@ LANE_FIRST = -1  # the lane nearest to the kerb that the class may use
 LANE_RANDOM = -2
 LANE_FREE = -3  # the lane with the fewest vehicles, among the lanes that the class may use
 LANE_ALLOWED = -4  # treated like LANE_FREE
-LANE_BEST = -5  # as LANE_FREE, among the lanes that the route can follow furthest
+LANE_BEST = -5  # like LANE_FREE, among the lanes on which the route can be followed furthest
 LANE_CURRENT = -6  # arrival: the present lane
 
 POS_GIVEN = 0
@@ -51,7 +51,7 @@ _DEPART_POS = {
     "random_free": POS_RANDOM_FREE,
     "last": POS_LAST,
     "stop": POS_STOP,
-    # SUMO also puts these vehicles at the start of the lane.
+    # SUMO, too, puts vehicles with these keywords at the start of the lane.
     "splitFront": POS_BASE,
     "random_location": POS_BASE,
 }
@@ -82,7 +82,9 @@ CODES = {
 }
 
 UNTIL_ABSOLUTE = 0  # time of the simulation
-UNTIL_FLOW = 1  # the same for a flow's first vehicle; shifted by the departure for later vehicles
+# Time of the simulation for a flow's first vehicle. For a later vehicle of the flow, the time is
+# later by as much as the vehicle's departure.
+UNTIL_FLOW = 1
 UNTIL_DEPARTURE = 2  # time since the vehicle's departure (stops of standalone routes)
 
 FLOW_REGULAR = 0  # also single vehicles, as flows of one

@@ -194,7 +194,7 @@ class Resolver:
     def _tolerates(self, vtype: int, user: Element) -> bool:
         """Return whether vehicles of this type without a route are left out instead of refused."""
         if self.types.permissions(vtype) & ~_PARTLY_MAPPED == 0:
-            what = f"type '{self.types.names[vtype]}' without a route: maps lack its own lanes"
+            what = f"type '{self.types.names[vtype]}' has no route: maps lack lanes of its class"
             self._report.tolerate(what, user.place)
             return True
         return self._skip

@@ -250,7 +250,8 @@ class TypeTable:
             if row >= 0:
                 found.append((row, weight))
         if left_out:
-            self._report.tolerate("type of no road class in a distribution", source.place)
+            what = "type that does not use roads is left out of a distribution"
+            self._report.tolerate(what, source.place)
             if not found:
                 return None
         return weighted(source, found)

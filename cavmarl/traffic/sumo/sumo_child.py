@@ -161,7 +161,7 @@ class SumoSimulation:
         present = set(self._vehicle.getIDList())
         puppets = set(self._puppets.values())
         absent = set(self._vehicle.getLoadedIDList()) - present - puppets
-        # Before the departure, its time is negative.
+        # SUMO reports a negative time of departure until the vehicle departs.
         self._waiting |= {name for name in absent if self._vehicle.getDeparture(name) < 0.0}
         self._renew_routes(present - puppets)
 

@@ -55,10 +55,10 @@ class SumoDemand:
     interface: str  # `libsumo` or `traci`
     version: str  # version of SUMO
     types: NDArray[np.void]  # VTYPE (num_types,) of the road vehicles
-    # VTYPE (n,) of this package's vehicles besides the car; follow `types` in a world's table
+    # VTYPE (n,) of this package's vehicles besides the car; a world's table has them after `types`
     puppets: NDArray[np.void]
     num_persons: int  # maximum number of persons that a world mirrors at a time
-    num_callers: int  # number of slots for vehicles of the caller, which persons' slots follow
+    num_callers: int  # number of slots for the caller's vehicles; then come the persons' slots
     outages: Mapping[str, float]  # time of failure by signal, in s since the reset
     reroutes: str  # which vehicles take another route if lanes change; empty: lanes do not change
     type_ids: tuple[str, ...]  # names of `types`, then of types that do not use roads

@@ -38,9 +38,11 @@ SEEN = np.dtype(
     ]
 )
 
-# A vehicle of this package in SUMO's conventions. Or a lane that changes: `kind` is `LANE_CHANGE`,
-# `edge` the LANE row, `id` the bits of the classes to which it is closed, `x` its limit in m/s. Or,
-# if SUMO only orders departures, a vehicle that asks for a route: `id` is its VEHICLE["order"].
+# A record that SUMO receives, of one of three kinds:
+# 1. a vehicle of this package, in SUMO's conventions (the comments below are about this kind);
+# 2. a lane that changes: `kind` is `LANE_CHANGE`, `edge` is the LANE row, `id` has the bits of the
+#    classes to which the lane is closed, and `x` is its limit in m/s;
+# 3. if SUMO only orders departures, a vehicle that asks for a route: `id` is its VEHICLE["order"].
 MOVED = np.dtype(
     [
         ("id", np.int64),  # VEHICLE["id"]

@@ -71,7 +71,7 @@ class SumoWorlds:
         self._begin_ms = round(1000.0 * demand.given.begin_s)
         self._processes: list[SumoProcess | None] = [None] * num_worlds
         self._ticks: list[SumoTick | None] = [None] * num_worlds
-        self._has_warned = [False] * num_worlds  # of persons without a slot, in this episode
+        self._has_warned = [False] * num_worlds  # of missing slots for persons, in this episode
         self._path_of = [np.zeros(0, dtype=np.int32) for _ in range(num_worlds)]
 
     @property

@@ -161,5 +161,5 @@ def test_mcity_is_read_without_its_cycle_lanes(shared_maps: Path) -> None:
     assert len(file.elements) == 23
     assert len(file.draw(0, until_s=3600.0)) > 2000
     assert file.report.tolerated["<personFlow> is not read"].count == 7
-    left_out = "type 'bike' without a route: maps lack its own lanes"
+    left_out = "type 'bike' has no route: maps lack lanes of its class"
     assert file.report.tolerated[left_out].count == 1

@@ -11,8 +11,8 @@ from cavmarl.traffic.scenarios.scene import Meeting, Outage, Scene, meetings, se
 from cavmarl.traffic.scenarios.streets import Crossing, Streets
 
 NEEDS = (
-    "a signal, and a straight movement that yields to another one when it is off, with 55 m of "
-    "road before it"
+    "a signal, and a straight movement that must yield to another movement while the signal is "
+    "off, with 55 m of road before it"
 )
 
 FAR_M = 50.0  # initial distance from the agent to the junction
