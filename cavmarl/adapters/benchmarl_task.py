@@ -27,8 +27,8 @@ class CavTaskClass(TaskClass):  # type: ignore[misc] # only installed in a separ
     """An environment; BenchMARL chooses the number of worlds, the device and the kind of action.
 
     The groups are `vehicles` and `signals`, each with its own policy. If signals have agents,
-    all agents choose: vehicles have meta-actions, because BenchMARL trains either continuous or
-    discrete actions.
+    all actions are discrete, because BenchMARL cannot train continuous and discrete actions
+    together: vehicles then have meta-actions.
 
     In `respawn` worlds, the default, an agent gets a new vehicle when its trip has ended.
     BenchMARL's losses have no mask: steps without a vehicle count, too, with an observation and a
@@ -73,7 +73,7 @@ class CavTaskClass(TaskClass):  # type: ignore[misc] # only installed in a separ
 
     @property
     def _choices(self) -> str:
-        """The environment's kind of action if it is a choice, otherwise meta-actions."""
+        """The environment's kind of action; `discrete` (meta-actions) instead of `continuous`."""
         kind = self._world.action.kind
         return "discrete" if kind == "continuous" else kind
 
@@ -87,7 +87,7 @@ class CavTaskClass(TaskClass):  # type: ignore[misc] # only installed in a separ
         return self._world.roadside is None
 
     def supports_discrete_actions(self) -> bool:
-        """Return True: meta-actions, or the grid of an environment with a grid of actions."""
+        """Return True: vehicles can have meta-actions, or the environment's grid of actions."""
         return True
 
     def max_steps(self, env: CavTorchRLEnv) -> int:

@@ -61,8 +61,8 @@ class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
 
     Raises:
         ConfigError: the rows cannot be distributed over the worlds; `overrides` or `arguments` have
-            a key that this view sets itself (`agents`, `population.budget`, and in worlds that are
-            not `open` `population.agents`); or a value is not allowed.
+            a key that this view sets itself (`agents`, `population.budget`; also
+            `population.agents`, unless the worlds are `open`); or a value is not allowed.
     """
 
     closed = True  # Gymnasium calls close() on garbage collection, even without an __init__

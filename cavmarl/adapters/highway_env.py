@@ -150,7 +150,11 @@ class HighwayEnv(CavEgoEnv):
         return float((total - worst) / (best - worst)) if best > worst else float(total)
 
     def _lane_and_merging(self) -> tuple[float, float]:
-        """Return the lane, 0 (leftmost) to 1, and the sum of the merging cars' speed deficits."""
+        """Return the place of the agent's lane, and the sum of the merging cars' speed deficits.
+
+        The place is from 0 (leftmost lane) to 1 (rightmost lane). A car's deficit is the difference
+        from the speed limit, as a share of the limit.
+        """
         network = self._env.network
         rows = self._env.worlds.simulation.vehicles(0)
         own = rows[rows["driver"] == DRIVER_AGENT]

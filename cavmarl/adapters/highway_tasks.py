@@ -51,8 +51,8 @@ class HighwayTask:
         entry: the environment of the task in `envs/`.
         config: highway-env's keys, in addition to `COMMON`.
         keys: keys of `env.yaml` that change the entry for the task.
-        worst: rewards with the smallest sum, which `normalize_reward` maps to 0.
-        best: rewards with the largest sum, which `normalize_reward` maps to 1.
+        worst: names of the rewards in the worst step; `normalize_reward` maps their sum to 0.
+        best: names of the rewards in the best step; `normalize_reward` maps their sum to 1.
         maps: number of lanes → map of the entry, if `lanes_count` selects one.
         merging: edge from which vehicles merge.
     """

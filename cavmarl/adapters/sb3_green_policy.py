@@ -83,7 +83,7 @@ class GreenNetwork(nn.Module):
 
 
 class GreenPolicy(ActorCriticPolicy):
-    """The policy of `GreenNetwork`, whose arguments are the option `net_arch` of the policy."""
+    """A policy with a `GreenNetwork`, whose arguments are the policy's option `net_arch`."""
 
     def _build_mlp_extractor(self) -> None:
         self.add_module("mlp_extractor", GreenNetwork(*self.net_arch))

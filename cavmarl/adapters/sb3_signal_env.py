@@ -45,9 +45,9 @@ class CavSb3SignalEnv(CavSb3VecEnv):
         kind: the agents of the rows: `signals`, or roadside units with speed `limits`.
         features: `lanes`: observations as the agents get them. `greens`: the rows of
             `GreenFeatures`, for `sb3_green_policy.GreenPolicy`.
-        spread: whether the first episodes of the worlds have different lengths, so that the worlds
-            are at different times of their episodes. Before the first decision, signals then follow
-            the durations of their programs for an episode.
+        spread: whether the worlds begin their first episodes at different times, so that later
+            they are at different times of their episodes. For this, the first `reset` runs the
+            worlds for about an episode, in which signals follow the durations of their programs.
         drivers: policy of the agents of vehicles, see `load_policy`; empty: the built-in driver.
         overrides: values of any other keys; `signals.agents` is `all` by default.
         arguments: other keyword arguments of `make_vec`; `agents` is 0 by default.
@@ -131,7 +131,7 @@ class CavSb3SignalEnv(CavSb3VecEnv):
     def sizes(self) -> tuple[int, int]:
         """The numbers of greens, and of values of a row that do not belong to a green."""
         if self._features is None:
-            raise ConfigError("sizes: rows of lanes have no sizes; pass features='greens'")
+            raise ConfigError("sizes: only rows of greens have sizes; pass features='greens'")
         return self._features.num_greens, self._features.num_shared
 
     def action_masks(self) -> NDArray[np.bool_]:

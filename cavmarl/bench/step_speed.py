@@ -85,7 +85,7 @@ class StepSpeed:
     ratio_kinematics: float  # `batched` over `highway_env`, with its default observation
     ratio_kinematics_raw: float  # like `ratio_kinematics`, but without normalisation
     cost_of_more: float  # cost per agent with `MORE` times the agents, over the cost of `batched`
-    dict_us: float  # cost of the dict API per agent and step, over `single`, in µs
+    dict_us: float  # µs that the dict API adds to the time of `single`, per agent and step
 
 
 def measure_step_speed(

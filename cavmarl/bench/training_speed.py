@@ -182,7 +182,7 @@ def training_program() -> Any:
 
 
 def _recipe(folder: Path, settings: Any) -> Any:
-    """Return settings of the same road as recommended in docs/guides/train.md."""
+    """Return settings for the same road, with the keys that docs/guides/train.md recommends."""
     entry = yaml.safe_load((folder / "env.yaml").read_text(encoding="utf-8"))
     for key, value in RECIPE_KEYS.items():
         shadow(entry, key, value)

@@ -38,8 +38,8 @@ def carla(
         Literal["obey", "refuse", "follow"],
         about(
             "The first client that ticks leads. If another client ticks, the world advances "
-            "(obey), that client gets an error (refuse), or it waits for the next tick of the "
-            "leading one (follow)."
+            "(obey), that client gets an error (refuse), or that client waits for the next tick "
+            "of the leading client (follow)."
         ),
     ] = "obey",
     recordings: Annotated[

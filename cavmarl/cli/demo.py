@@ -184,7 +184,7 @@ def _show(console: Console, found: EvaluationReport) -> None:
 
 
 def _story(task: DemoTask, trained: Path, found: EvaluationReport, films: dict[str, Path]) -> Any:
-    """Return the story of the page, in the figures of this run."""
+    """Return the introduction of the page, with the figures of this run."""
     from cavmarl.evaluate.page import Story
 
     return Story(

@@ -148,7 +148,7 @@ def evacuate(
             )
         found.append(run)
         if run.contacts:
-            places = escape(", ".join(run.contact_places) or "roads that no sample shows")
+            places = escape(", ".join(run.contact_places) or "unknown roads (between samples)")
             console.print(f"contacts: {run.contacts}, on {places}")
         for road in (road for road, count in run.contraflow.items() if not count):
             console.print(f"contraflow: no vehicle used the lanes on {escape(road)}")

@@ -129,8 +129,8 @@ def form_of_driver(policy: str | Path) -> Form:
     if not forms:
         trained = ", ".join(name for name, path in agent_entries().items() if path.is_dir())
         raise PolicyError(
-            f"The driver '{policy}' is a script or a model file, which does not state sensors: "
-            "it accepts the environment's sensors, or states its needs. Name a trained "
+            f"The driver '{policy}' is a script or a model file. Only the folder of a trained "
+            "driver states sensors that an environment can copy. Name a trained "
             f"driver ({trained}), or leave sensors_of (--sensors-of) out"
         )
     return common_form(forms)

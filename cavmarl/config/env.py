@@ -346,7 +346,7 @@ class EnvConfig(Section, key=""):
     def tells_sumo(self) -> bool:
         """Whether SUMO receives commands during an episode, so that it deviates from its demand.
 
-        SUMO receives cavmarl's vehicles if it moves vehicles, and changes of lanes.
+        SUMO receives changes of lanes and, if SUMO moves vehicles, also cavmarl's vehicles.
         """
         source = self.traffic.source
         return source == "sumo-traffic" or (source != "native" and self.may_change_lanes)

@@ -57,8 +57,8 @@ class CavmarlError(Exception):
 class ConfigError(CavmarlError):
     """An invalid configuration: unknown key, wrong value, impossible combination.
 
-    Also raised for zones that overlap or whose view is too short for exact results, loads or
-    workers that allow no placement of a shard, and scenarios that are unknown or invalid.
+    Also raised if zones overlap or do not see far enough for exact results, if the workers or their
+    loads allow no placement of a shard, and if a scenario is unknown or invalid.
     """
 
 
@@ -186,7 +186,7 @@ class WorkerDeathError(WorkerError):
     Attributes:
         worker: number of the worker.
         part: description of the worker's worlds or zones.
-        order: number of the order that the worker could not execute.
+        order: number of the command that the worker could not execute.
         causes: cause of each death.
     """
 
@@ -201,7 +201,7 @@ class WorkerDeathError(WorkerError):
         "print to standard error; backend='local' runs the same worlds in this process",
     ) -> None:
         super().__init__(
-            f"worker {worker} ({part}) could not do its {what} (order {order}): {len(causes)} "
+            f"worker {worker} ({part}) could not do its {what} (command {order}): {len(causes)} "
             f"processes died ({', '.join(causes)}). {cure}"
         )
         self.worker, self.part, self.order, self.causes = worker, part, order, tuple(causes)

@@ -147,5 +147,5 @@ def start_python(
 
 @cache
 def _staying_thread(_: int) -> ThreadPoolExecutor:
-    """Return one thread per process: a fork does not inherit it."""
+    """Return the thread that starts processes; a fork of this process needs a thread of its own."""
     return ThreadPoolExecutor(1, "starts-processes")

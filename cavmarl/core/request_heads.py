@@ -13,8 +13,9 @@ HEAD_S = 10.0  # time limit of a request head, and of what follows an answered r
 class BoundedHeads(HttpToolsProtocol):
     """HTTP that closes connections with long or slow request heads; uvicorn itself accepts them.
 
-    The length includes everything except bodies, such as trailers. An application limits the
-    time of the body that it reads; the time of a body that it did not read is limited here.
+    The limit of the length applies to everything except bodies, so trailers count. An application
+    limits the time of the body that it reads; the time of a body that it did not read is limited
+    here.
     """
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]

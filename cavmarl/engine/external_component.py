@@ -97,7 +97,7 @@ class ExternalComponent(Component):
         if not is_told or self._ticks.item(0) % self._ticks_per_step:
             return
         told, held = self._commands_of(commands), self.held
-        held["speed"][held["kind"] == EXTERNAL_POSED] = np.nan  # such vehicles are at their poses
+        held["speed"][held["kind"] == EXTERNAL_POSED] = np.nan  # they have reached their poses
         self.has_news = bool(told["kind"].any())
         if not self.has_news:
             return

@@ -57,7 +57,7 @@ class Peers:
         return self._division.running()
 
     def clear_ranks(self, departures: DepartureQueue) -> None:
-        """Clear the ranks of lanes where departures may enter, before zones write them."""
+        """Clear `departures.ranks`, the crowding of lanes for departures, before zones write it."""
 
     def share_ranks(self, departures: DepartureQueue) -> None:
         """Exchange `departures.ranks` and `departures.last_s`, as the zones wrote them."""

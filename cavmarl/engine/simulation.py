@@ -189,9 +189,11 @@ class Simulation(WorldViews):
         self._tick.instrument(wrap)
 
     def trace(self, wrap: Callable[[Executor], Executor], note: Callable[[str], None]) -> None:
-        """Report the phases of a tick: shards' phases to `wrap(executor)`, components' to `note`.
+        """Report each phase of a tick when it begins.
 
-        A component with phases of its own (such as another simulator's step) has a method `trace`.
+        The executor `wrap(executor)` runs the shards' phases from now on, and `note` is called with
+        the name of each phase of the components. A component with phases of its own (such as
+        another simulator's step) has a method `trace`.
         """
         self._tick.trace(wrap, note)
 

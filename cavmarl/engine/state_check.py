@@ -245,7 +245,7 @@ class StateForm(NamedTuple):
             if len(np.unique(agents)) < len(agents):
                 return f"world {w} has two vehicles of one agent"
             if (waiting["speed_factor"] < LEAST_FACTOR).any():
-                return f"world {w} has a vehicle in the queue that never drives"
+                return f"world {w} has a vehicle in the queue whose speed factor is too low"
             check = self.division.row_check
             # SUMO's vehicles get order numbers when they enter, so the largest one is not known.
             numbers = num_orders if self.traffic.sumo is None else MOST

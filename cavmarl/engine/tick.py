@@ -212,7 +212,7 @@ class Tick:
             self.outside = SumoPhases(wrap(self.outside.sumo), self.outside.callers)
 
     def trace(self, wrap: Callable[[Executor], Executor], note: Callable[[str], None]) -> None:
-        """Report phases: shards' phases to `wrap(executor)`, components' phases to `note`.
+        """Report each phase when it begins; see `Simulation.trace`.
 
         A component with phases of its own has a method `trace`.
         """

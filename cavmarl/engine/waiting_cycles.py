@@ -94,7 +94,7 @@ def _foes(
     queues: Mapping[int, Sequence[int]],
     link: int,
 ) -> list[int]:
-    """Return the vehicles on the links to which a link must yield, and the next ones onto them."""
+    """Return the vehicles on the links to which a link must yield, and the next to enter them."""
     first = int(network.links["first_conflict"][link])
     conflicts = network.conflicts[first : first + int(network.links["num_conflicts"][link])]
     found: list[int] = []

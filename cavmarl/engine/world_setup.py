@@ -328,7 +328,7 @@ def find_map(env: str | Path) -> Path:
 
 
 def check_agents(config: EnvConfig, *, may_be_alone: bool = False) -> None:
-    """Refuse a world without agents where a caller wants to drive one.
+    """Refuse a world without agents if the caller wants to drive agents.
 
     `may_be_alone`: whether a world with `traffic.demand` may have no agents.
     """

@@ -55,7 +55,7 @@ class Insertions:
             return "the number of insertions is out of range"
         is_waiting = np.arange(self._most) < waiting[:, np.newaxis]
         if (rows[~is_waiting] != (INSERT_NONE, INSERT_NONE, INSERT_NONE)).any():
-            return "an insertion is not counted"
+            return "an unused row of insertions is not empty"
         return wrong_insertions(rows[is_waiting], self._network.lanes)
 
     def vehicle(self, world: int, lane: str, position_m: float) -> None:

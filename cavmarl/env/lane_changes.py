@@ -147,7 +147,7 @@ class LaneChanges:
     ) -> None:
         """Close a road, and open its contraflow lanes once no vehicle is on it.
 
-        If other roads that are being reversed lead to this road, it closes once they are empty.
+        If roads that are being reversed lead to this road, this road closes once those are empty.
 
         Raises:
             ActionError: there is no such world or road, the road is the last way out of others or
@@ -331,7 +331,7 @@ class LaneChanges:
             raise ActionError(f"edge {edge!r}: the map has no such road; give the id of one")
         if is_contraflow(edge):
             raise ActionError(
-                f"edge {edge!r} are contraflow lanes: reverse or open the road below instead"
+                f"edge {edge!r} are contraflow lanes: reverse or open the road that has these lanes"
             )
         first = int(self._network.edges["first_lane"][number])
         count = int(self._network.edges["num_lanes"][number])

@@ -132,7 +132,10 @@ class ReversedRoads:
             opened = (np.isin(changed, back) & (classes > 0.0)).sum(axis=1)
             is_reversed = state[:, road] == REVERSED_NOW
             if (opened != np.where(is_reversed, len(back), 0)).any():
-                return "contraflow lanes of a road that is not reversed are open, or the reverse"
+                return (
+                    "contraflow lanes are open on a road that is not reversed, or closed on a "
+                    "reversed road"
+                )
             closed = (np.isin(changed, own) & (classes == ALL_PERMISSIONS)).sum(axis=1)
             is_shut = np.isin(state[:, road], (CLEARING, REVERSED_NOW, RETURNING))
             if (is_shut & (closed != len(own))).any():

@@ -63,7 +63,7 @@ def load_session(session: StepSession, mask: NDArray[np.bool_], saved: bytes) ->
         or session.external.wrong(rest[7:9])
         or session.overrides.wrong(rest[9:10])
         or session.lane_changes.wrong(rest[10:12])
-        or ("a world has a negative size" if (sizes < 0).any() else "")
+        or ("the state of a world has a negative size" if (sizes < 0).any() else "")
     ):
         raise ConfigError(f"the saved state is damaged: {wrong}; save again")
     contents = np.split(joined, np.cumsum(sizes)[:-1])

@@ -174,9 +174,10 @@ class WorldsEnvironment(OwnWorlds):
         """Close lanes of a road, until they are opened or the episode is over.
 
         From the next step on, no vehicle enters the lanes, except vehicles that cannot stop in
-        time. Vehicles on the lanes leave them. The vehicles of `population.reroute` take another
-        route within a second. Vehicles without another route wait before the closed lanes, and
-        departures on them wait in the queue. Each lane counts towards `map.changed_lanes`.
+        time. Vehicles on the lanes leave them. Vehicles that may change their route
+        (`population.reroute`) do so within a second. Vehicles without another route wait before the
+        closed lanes, and vehicles that are to depart on these lanes wait in the queue. Each lane
+        counts towards `map.changed_lanes`.
 
         Args:
             edge: id of a road.

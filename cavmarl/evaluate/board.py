@@ -1,10 +1,11 @@
 """The board: a page of drivers whose recorded results were verified by repeating the evaluation.
 
 An entry is a folder NAME with a card (README.md), a finished evaluation of one driver (`result/`,
-with a closed manifest), and the driver: `model.safetensors`, `config.json` and the manifest of the
-training, or a script NAME.py, or a model file of another library, such as NAME.zip. Without these
-files, the driver is cavmarl's script of that name. Models of other libraries are not verified,
-because their arithmetic differs between processors and versions; they are shown as such.
+with a manifest that lists the hashes of the results), and the driver: `model.safetensors`,
+`config.json` and the manifest of the training, or a script NAME.py, or a model file of another
+library, such as NAME.zip. Without these files, the driver is cavmarl's script of that name. Models
+of other libraries are not verified, because their arithmetic differs between processors and
+versions; the page marks them.
 """
 
 from __future__ import annotations
@@ -137,7 +138,7 @@ def check_entry(folder: Path, progress: Progress | None = None) -> Verification:
         raise ConfigError(f"{folder}: is not a folder; give the folder of an entry")
     folder = folder.resolve()  # replaces `.` by the folder's real name
     if not (folder / CARD_FILE).is_file():
-        raise ConfigError(f"{folder}: has no {CARD_FILE}; write a card that says what it is")
+        raise ConfigError(f"{folder}: has no {CARD_FILE}; write a card that describes the driver")
     driver = entry_driver(folder)
     if driver == folder:
         _check_training(folder)

@@ -70,7 +70,7 @@ class FailureClips:
         self._recent.clear()
 
     def add(self, frames: Iterable[WorldFrame]) -> None:
-        """Record the present moment of worlds."""
+        """Record the present frames of worlds."""
         for frame in frames:
             kept = self._recent.setdefault(frame.world, deque(maxlen=self._length))
             kept.append((frame, self._observations[frame.world].copy() if self._keeps else None))

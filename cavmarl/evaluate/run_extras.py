@@ -28,7 +28,7 @@ class RunWatch:
         seed: seed of the run.
         record: options of the recording; None: no recording.
         failures: number of failed trips to keep.
-        look: called at each moment of the worlds.
+        look: called after each reset and step of the worlds.
     """
 
     def __init__(

@@ -115,9 +115,10 @@ def run_suite(
 ) -> dict[str, EvaluationReport]:
     """Evaluate the policies in every world, each in its own folder in `out`.
 
-    If the suite sets the number of agents, trips that end are replaced (respawn), so that the
-    number stays the same. `began` is called before each world. `overrides` are values of further
-    keys of every world. Policies, episodes, repeats, seed, zones and backend are as in `evaluate`.
+    If the suite sets the number of agents, an agent whose trip ends gets a new vehicle (`respawn`),
+    so that the number of vehicles stays the same. `began` is called before each world. `overrides`
+    are values of further keys of every world. Policies, episodes, repeats, seed, zones and backend
+    are as in `evaluate`.
     """
     reports = {}
     keys: dict[str, object] = {}

@@ -93,7 +93,7 @@ TRANSFER = np.dtype(
     [
         ("run", np.int64),
         ("episode", np.int64),
-        ("tick", np.int64),  # counted over the whole run of the world, not reset
+        ("tick", np.int64),  # counted over all episodes of the world
         ("vehicle", np.int64),
         ("source", np.int64),
         ("target", np.int64),
@@ -120,7 +120,7 @@ RESOURCE = np.dtype(
         ("wall_s", np.float64),  # wall time of the window
         ("cpu_s", np.float64),  # processor time in the window
         ("memory_bytes", np.float64),  # resident at the end of the window
-        ("waited_s", np.float64),  # time a node waited for frames; NaN: unknown (also below)
+        ("waited_s", np.float64),  # time a node waited for frames; NaN, here and below: unknown
         ("sent_bytes", np.float64),  # to other nodes and to the caller
         ("sent_frames", np.float64),
         ("vehicles", np.float64),  # owned at the end of the window, in all worlds

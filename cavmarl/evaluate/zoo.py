@@ -1,8 +1,8 @@
 """The zoo: trained drivers with results that can be verified by repeating the evaluation.
 
 An entry is the folder of a trained driver with a folder `result/`: a finished evaluation of
-`cavmarl evaluate`, with a closed manifest. To verify an entry, its evaluation is repeated and the
-bytes are compared.
+`cavmarl evaluate`, whose manifest lists the hashes of the results. To verify an entry, its
+evaluation is repeated and the bytes are compared.
 """
 
 from __future__ import annotations

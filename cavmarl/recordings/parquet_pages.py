@@ -50,7 +50,7 @@ def parquet_size(content: memoryview) -> ParquetSize:
     groups = _items(footer, _ROW_GROUPS)
     num_rows = _number(footer, _NUM_ROWS)
     if sum(_number(group, _ROWS_OF_GROUP) for group in groups) != num_rows:
-        raise ValueError(f"it has {num_rows} rows, but its row groups have another number")
+        raise ValueError(f"it has {num_rows} rows, but its row groups state another number of rows")
     columns: dict[int, ColumnSize] = {}
     for group in groups:
         for k, column in enumerate(_items(group, _COLUMNS)):
@@ -81,7 +81,7 @@ def _column_size(content: memoryview, column: Any) -> ColumnSize:
         values, words = values + number * has_rows, words + number * (not has_rows)
         size += page
     if values != _number(metadata, _NUM_VALUES):
-        raise ValueError(f"column {path} has other values than its pages")
+        raise ValueError(f"column {path} states another number of values than its pages")
     return ColumnSize(path, values, words, size)
 
 

@@ -15,7 +15,7 @@ from cavmarl.recordings.parquet_pages import ParquetSize, parquet_size
 
 # Limits for one table or one column in one part.
 MOST_ROWS = 1 << 22  # rows of a table
-MOST_RECORDS = 1 << 20  # rows of a table with texts or lists; structures in lists
+MOST_RECORDS = 1 << 20  # rows of a table with texts or lists; structures in a column's lists
 MOST_VALUES = 1 << 26  # values of a column with lists
 MOST_BYTES = 1 << 31  # bytes of the rows of a table
 MOST_TEXT_BYTES = 1 << 28  # bytes of the texts of a column
@@ -128,7 +128,10 @@ def _too_large(size: ParquetSize, file_bytes: int, schema: Any) -> str:
     numbers = rows * sum(map(_plain_bytes, schema.types))
     pages = sum(column.num_bytes for column in size.columns)
     if max(numbers, pages) > min(MOST_BYTES, MOST_RATIO * file_bytes):
-        return f"it has {rows} rows of {max(numbers, pages)} bytes in {file_bytes} bytes"
+        return (
+            f"its {rows} rows take {max(numbers, pages)} bytes in memory, which is too much for a "
+            f"file of {file_bytes} bytes"
+        )
     for column in size.columns:
         if column.num_values != rows and "." not in column.path:
             return f"column {column.path} has {column.num_values} values for {rows} rows"

@@ -68,8 +68,8 @@ class Window:
             self._window = None
 
 
-# A following camera: smallest visible extent, and the share of its distance to the followed
-# vehicles or place that it moves per picture.
+# A camera that follows vehicles or a place: its smallest visible extent; and the share of the
+# distance to them that it covers per picture.
 FOLLOW_M = 150.0
 FOLLOW_SHARE = 0.12
 MARGIN_PX = 50.0  # margin for the overlays in the corners

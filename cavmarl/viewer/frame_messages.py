@@ -25,7 +25,7 @@ from cavmarl.render.shapes import level_of
 ROSTER_MESSAGE = 2
 FRAME_MESSAGE = 3
 
-ROSTER_HEAD = struct.Struct("<BBxxIII")  # message, whole, version, rows, number of removed ids
+ROSTER_HEAD = struct.Struct("<BBxxIII")  # message, is whole, version, rows, removed ids
 # message, flags, world, version, time, tick, pace, vehicles, signals, ghost zones
 FRAME_HEAD = struct.Struct("<BBHIdIfIII")
 PAUSED = 1  # flag of a frame: the world is paused

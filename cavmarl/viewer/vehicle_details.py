@@ -45,7 +45,7 @@ ViewedEnv = CavEnv | CavVectorEnv
 def hello_of_map(
     title: str, network: RoadNetwork, partition: ZonePartition, step_s: float
 ) -> dict[str, Any]:
-    """Return the first message to a page about any world: JSON, metres from the map's origin."""
+    """Return what all first messages to pages contain; positions in m from the map's origin."""
     origin = map_origin(network)
     min_x, min_y, max_x, max_y = network.extent_m
     zones: list[list[float]] = []

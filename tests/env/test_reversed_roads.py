@@ -207,7 +207,7 @@ def test_saved_states_with_invalid_reversals_are_refused(tmp_path: Path) -> None
         assert changes.wrong((told, states)) == ""
         for place, value, message in (
             ((0, 1, 0), 5, "unknown state"),
-            ((0, 1, 0), 2, "is not reversed are open, or the reverse"),
+            ((0, 1, 0), 2, "is not reversed, or closed on a reversed road"),
             ((0, 0, 0), 1, "a reversed road is open"),
             ((0, 0, 0), 3, "a reversed road is open"),
             ((0, 1, 1), -2, "unknown state"),

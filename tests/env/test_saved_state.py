@@ -110,7 +110,7 @@ SIZES = -2
         (INSERTED, 0, 9.0, "an insertion has an unknown kind"),
         (WAITING, 0, -1, "the number of insertions is out of range"),
         (WAITING, 0, 3, "the number of insertions is out of range"),
-        (WAITING, 0, 0, "an insertion is not counted"),
+        (WAITING, 0, 0, "an unused row of insertions is not empty"),
         (USED, 0, 99, "the number of insertions is out of range"),
         (LAST, 0, 1.5, "a last action is out of range"),
         (LAST, 0, np.nan, "a last action is out of range"),
@@ -119,7 +119,7 @@ SIZES = -2
         (INSERTED, 1, 0.5, "an insertion is on a lane that does not exist"),
         (INSERTED, 2, -1.0, "an insertion is before the start or beyond the end of its lane"),
         (INSERTED, 2, np.nan, "an insertion is before the start or beyond the end of its lane"),
-        (SIZES, 0, -1, "a world has a negative size"),
+        (SIZES, 0, -1, "the state of a world has a negative size"),
     ],
 )
 def test_invalid_values_outside_of_the_simulation_are_refused(

@@ -202,7 +202,7 @@ def test_a_page_with_more_values_than_its_column_is_refused(good: Path, bad: Pat
     assert parquet_size(memoryview(content)).columns[0].num_values == 1000
     head = content.index(b"\x15\xd0\x0f")  # number of values: 1000
     forged = content[:head] + b"\x15\xd2\x0f" + content[head + 3 :]
-    with pytest.raises(ValueError, match="other values than its pages"):
+    with pytest.raises(ValueError, match="another number of values than its pages"):
         parquet_size(memoryview(forged))
 
 

@@ -60,7 +60,7 @@ def step(
         notes=[
             f"batched over highway-env: [bold]{found.ratio:,.0f}[/] with a lidar, "
             f"[bold]{found.ratio_kinematics:,.0f}[/] without "
-            f"({found.ratio_kinematics_raw:,.0f} over its raw observation)",
+            f"({found.ratio_kinematics_raw:,.0f} over highway-env's raw observation)",
             f"with ten times as many agents, each costs [bold]{found.cost_of_more:.2f}[/] times as "
             f"much; dicts add [bold]{found.dict_us:.2f} µs[/] per agent and step",
         ],

@@ -203,4 +203,4 @@ class CallSequence:
             at += 1
 
 
-assert (ENTRY, ADDRESS, TARGET) == (0, 1, 2)  # the order of a row in `CallSequence`
+assert (ENTRY, ADDRESS, TARGET) == (0, 1, 2)  # the columns of a row in `CallSequence`

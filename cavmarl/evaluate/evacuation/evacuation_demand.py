@@ -65,8 +65,8 @@ def find_evacuees(
     """Return the vehicles of a plan.
 
     The vehicles of an area are spread evenly over the length of its lanes, and drawn in random
-    order. Each vehicle takes the exit that it reaches first, if one vehicle passes each lane of an
-    exit every `HEADWAY_S`.
+    order. Each vehicle takes the exit that it would pass earliest, on the assumption that each lane
+    of an exit lets one vehicle pass every `HEADWAY_S`.
 
     Args:
         plan: the plan; roads in `contraflow` are closed.
@@ -208,7 +208,7 @@ def _spread(
 def _shared_exits(
     times_s: NDArray[np.float64], depart_s: NDArray[np.float64], lanes: NDArray[np.int32]
 ) -> NDArray[np.int64]:
-    """Return the exit (n,) that each vehicle reaches first, in the order of departures.
+    """Return the exit (n,) that each vehicle would pass earliest, in the order of departures.
 
     `times_s`: (num_exits, n) time from vehicle to exit. `lanes`: (num_exits,) lanes of each exit.
     """

@@ -55,8 +55,8 @@ class EvacuationPlan(Section, key=""):
         within_s: vehicles depart evenly within this time after the order.
         horizon_s: simulated time.
         background: vehicles of the generator, which drive to their own goals.
-        reroute_s: time between two searches of a vehicle for a faster route, which considers the
-            speeds of the last minutes; 0: one search, after its departure.
+        reroute_s: time between two searches of a vehicle for a faster route; a search considers
+            the speeds of the last minutes. 0: a single search, after the departure.
         events: roads that close, open, or slow down; see `map.events`.
     """
 

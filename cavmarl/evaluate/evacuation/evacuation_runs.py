@@ -26,7 +26,7 @@ STEP_S = 1.0
 TICK_S = 0.1
 STANDING_MPS = 0.5
 SHARES = (0.5, 0.9, 1.0)  # shares of an area's vehicles, for the clearance times
-RECOVERED_SHARE = 1.1  # stopped vehicles after recovery / before the closure, at most
+RECOVERED_SHARE = 1.1  # most stopped vehicles after recovery, as a share of those before closure
 ENTRY, DEMAND = "env.yaml", "demand.rou.xml"
 Told = Callable[[int, int], None]
 

@@ -145,7 +145,10 @@ def _mean_likelihood(name: str, likelihoods: Numbers, valid: NDArray[np.bool_]) 
 def _event_likelihood(
     name: str, log: RolloutFeatures, rollouts: Sequence[RolloutFeatures], first: int
 ) -> float:
-    """Return the likelihood, by rollouts, that each object has or lacks the event as in the log."""
+    """Return the geometric mean likelihood of the log: which objects have the event or lack it.
+
+    The likelihood of an object is the share of the rollouts that agree with the log about it.
+    """
     kind = "collided" if name == "collision_indication" else "off_road"
     seen = log.valid[:, first:]
     happened = (getattr(log, kind)[:, first:] & seen).any(axis=1)

@@ -14,7 +14,7 @@ export class Placing {
     this.kind = kind;
     for (const id of KINDS) $(id).setAttribute("aria-pressed", String(id === kind));
     $("scene").classList.toggle("placing", kind !== null);
-    const how = "Click on a road, or press Enter for the one in the middle. Escape cancels.";
+    const how = "Click on a road, or press Enter for the road in the middle. Escape cancels.";
     notice(kind ? how : "");
     if (kind) $("scene").focus();
   }

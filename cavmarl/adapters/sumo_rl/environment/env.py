@@ -454,7 +454,7 @@ class SumoEnvironmentPZ(AECEnv, EzPickle):  # type: ignore[misc] # PettingZoo is
         self._inform()
 
     def _inform(self) -> None:
-        """Give each signal the values of all vehicles and its own, selected as in sumo-rl."""
+        """Set the info of each signal as in sumo-rl: values of all vehicles and of the signal."""
         infos = self.env.compute_info()
         self.infos = {
             ts: {name: value for name, value in infos.items() if name.startswith((ts, "system"))}

@@ -209,7 +209,7 @@ class SignalWorld:
     def greens(self, signal: int) -> tuple[int, int, float]:
         """Return a signal's previous and current green, and the time since the last change.
 
-        Signals that follow their programs always have 0.
+        All three are 0 if signals follow their programs.
         """
         if self._settings.follows_programs:
             return 0, 0, 0.0

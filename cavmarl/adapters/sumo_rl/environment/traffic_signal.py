@@ -189,7 +189,7 @@ class TrafficSignal:
         return spaces.Box(-np.inf, np.inf, (self.reward_dim,), np.float32)
 
     def choice(self, action: Any) -> int:
-        """Return the green of an action, or the next one if it would exceed `max_green`.
+        """Return the green of an action, or the next green if the action would exceed `max_green`.
 
         Raises:
             ActionError: the action is not the index of a green.
@@ -271,7 +271,7 @@ class TrafficSignal:
         return int(self._world.counts[self._in, STANDING].sum())
 
     def _shares(self, lanes: list[int], column: int) -> list[float]:
-        """Return counts of lanes as shares of the vehicles that they hold, at most 1."""
+        """Return a count of vehicles on each lane as a share of the lane's capacity, at most 1."""
         found = []
         for lane, counts in zip(lanes, self._world.counts[lanes].tolist(), strict=True):
             vehicles = counts[VEHICLES]
