@@ -19,8 +19,8 @@ def refine(
     placement: Placement,  # changed and returned
     *,
     until_s: float = 0.0,  # a makespan that is good enough
-    # a change that separates fewer neighbours is preferred to the fastest change, if its makespan
-    # is longer by at most this
+    # a change that separates fewer neighbours is preferred to the fastest change, if this makes the
+    # makespan longer by at most `slack_s`
     slack_s: float = 0.0,
     max_moves: int | None = None,  # limit of moved shards; a swap counts as two. None: no limit
 ) -> Placement:

@@ -22,7 +22,7 @@ GPU_QUERY = ("--query-gpu=utilization.gpu", "--format=csv,noheader,nounits")
 
 
 def take_snapshot(
-    # number → process id; None: not started yet, and will run on this process's cores
+    # number → process id; None: the worker has no process yet, and will run on this process's cores
     workers: Mapping[int, int | None],
     interval_s: float = INTERVAL_S,  # duration of the measurement and of this call
 ) -> LoadSnapshot:

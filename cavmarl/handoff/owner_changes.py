@@ -58,7 +58,9 @@ class OwnerChanges:
             found = np.flatnonzero(worlds.rows["id"][w, : worlds.num_owned[w]] == vehicle)
             if len(found):
                 return shard.zone, int(found[0])
-        raise ConfigError(f"no zone of world {w} owns vehicle {vehicle}; use the id of a vehicle")
+        raise ConfigError(
+            f"no zone of world {w} owns vehicle {vehicle}; use the id of a vehicle in this world"
+        )
 
     def state(self, w: int, zone: int, row: int) -> bytes:
         """Return the complete state of a zone's owned vehicle, from its committed row."""
@@ -69,7 +71,7 @@ class OwnerChanges:
         self,
         w: int,
         switch: Switch,  # the vehicle, its source and its target
-        hint: int = 0,  # the probable row at the source
+        hint: int = 0,  # index of the row at the source, if known: it is searched first
     ) -> int:  # the row at the target
         """Change a vehicle's owner. The target receives a copy of the source's committed row."""
         place = self._pass_on(

@@ -162,7 +162,7 @@ def limits_of(settings: ZonesConfig, schema: int = 1) -> Limits:
 
 
 def _limits_at_borders(settings: ZonesConfig, late_ticks: int) -> Limits:
-    """Return the deadlines if no message is lost: the deadlines of leases (decision 013)."""
+    """Return the deadlines if no message is lost: a vehicle is late by `late_ticks` at most."""
     return replace(limits_of(settings), deferral=late_ticks)
 
 

@@ -59,7 +59,7 @@ class OwnedTally(NamedTuple):
         difference = (
             f"{other.vehicles} vehicles instead of {self.vehicles}"
             if self.vehicles != other.vehicles
-            else f"{self.vehicles} vehicles, but not the expected ones or not at their epochs"
+            else f"{self.vehicles} vehicles as expected, but with other ids or epochs"
         )
         raise ProtocolError(f"{where}: {difference}")
 

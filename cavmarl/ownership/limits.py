@@ -17,7 +17,7 @@ class Limits:
     lifetime: int = 16  # ticks after which a replica that is not refreshed is dropped (K)
     attempts: int = 3  # number of times that a PREPARE is sent in one tick (A)
     repeats: int = 3  # limit of new hosts for one tick of one zone (R_max)
-    backoff: int = 4  # ticks after a refusal without an offer of that vehicle to that target
+    backoff: int = 4  # ticks after a refusal without a new offer of the vehicle to the target
     capacity: int = 100_000  # limit of the replicas that one host keeps
     schema: int = 1  # version of the vehicles' states
 

@@ -121,8 +121,9 @@ class Table:
             zone, epoch = owners.pop(vehicle)
             counts[zone] -= 1
             moves.append((vehicle, zone, epoch, False))
-        # With more moves than vehicles, `tallies` ignores the moves and counts all vehicles. One
-        # surplus move is kept to show this. It stays in surplus: a new vehicle also adds a move.
+        # If there are more moves than vehicles, `tallies` counts the vehicles instead.
+        # So one move more than there are vehicles is enough. After further changes, there are still
+        # more moves than vehicles, because each new vehicle also adds a move.
         del moves[len(owners) + 1 :]
         self.tick = tick
 
@@ -186,7 +187,9 @@ class Table:
 
     def _begin(self, record: Begin) -> None:
         if self.plan is not None or record.tick != self.tick + 1:
-            raise JournalError(f"BEGIN of tick {record.tick} after tick {self.tick}, or repeated")
+            raise JournalError(
+                f"BEGIN of tick {record.tick} after tick {self.tick}, or during a tick"
+            )
         if record.switches or record.births:
             self._check_zones(switch.target for switch in record.switches)
             self._check_zones(birth.zone for birth in record.births)

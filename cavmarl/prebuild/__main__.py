@@ -1,6 +1,7 @@
 """`python -m cavmarl.prebuild`: compile the kernels of the package, and maintain their list.
 
-compile         compile the kernels of a plain world (--all: all kernels) into this machine's cache
+compile         compile the kernels for the first step of simple environments (`PLAIN_WORLDS`) into
+                this machine's cache; --all: all kernels
 build FOLDER    compile all kernels for the wheel's processor, and link them into a library
 record FOLDER   add the calls in FOLDER, recorded by programs with `CAVMARL_KERNEL_CALLS=FOLDER`, to
                 the list of kernels, and remove calls that have become impossible
@@ -93,7 +94,7 @@ env.step({agent: env.action_space(agent).sample() for agent in env.agents})
 
 
 def _calls_of_plain_worlds() -> set[KernelCall]:
-    """Return the calls in the first step of each plain world, with a new and a cached map."""
+    """Return the calls in the first step of `PLAIN_WORLDS`, with a new and a cached map."""
     with TemporaryDirectory() as folder:
         calls, cache = Path(folder, "calls"), Path(folder, "cache")
         calls.mkdir()

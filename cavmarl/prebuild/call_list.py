@@ -27,7 +27,7 @@ class KernelCall(NamedTuple):
 
     name: str
     signature: str  # as JSON
-    is_plain: bool = False  # whether the first step of a plain world makes this call
+    is_plain: bool = False  # whether a first step in `PLAIN_WORLDS` makes this call
 
     @property
     def kinds(self) -> list[Any]:

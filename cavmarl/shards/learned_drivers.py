@@ -91,7 +91,10 @@ def _learned(
 def _exchanged_sides(
     driver: BackgroundDriver, network: RoadNetwork
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return how to exchange left and right in an observation; empty: the driver keeps its side."""
+    """Return how to exchange left and right in an observation.
+
+    The arrays are empty if the driver was trained on the map's side of the road.
+    """
     if not is_other_side(untrained_kinds(network, driver.maps)):
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.float32)
     try:

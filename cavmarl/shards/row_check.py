@@ -204,7 +204,7 @@ class RowCheck:
         wrong |= (rows["lane_stood"] < -1) | (stood_lane >= self._num_lanes)
         if not wrong.any():
             return ""
-        return _of(rows[np.argmax(wrong)], "order", "is invalid, or its id or tick is invalid")
+        return _of(rows[np.argmax(wrong)], "order", "is invalid, or its id, tick or lane_stood is")
 
     def _wrong_ways(self, rows: NDArray[np.void], tail: NDArray[np.void] | None) -> str:
         """Check that routes are valid. Follow a route if its first step may be of another lane."""

@@ -58,7 +58,10 @@ CONTROLLER = np.dtype(
 
 @dataclass(frozen=True)
 class Commands:
-    """Decoded actions of one step."""
+    """Decoded actions of one step.
+
+    The default of an array has a shape with zeros. The comments explain what this shape means.
+    """
 
     # (W, A, 2) throttle in m/s² and steering in rad; continuous actions
     controls: NDArray[np.float64]

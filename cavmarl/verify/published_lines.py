@@ -18,10 +18,10 @@ from cavmarl.core.errors import ConfigError
 
 LINES_FILE = Path("docs/figures/lines.yaml")
 NUMBER = r"[-+]?(?:[0-9]{1,3}(?:,[0-9]{3})+|[0-9]+)(?:\.[0-9]+)?"
-FREE_NUMBER = re.compile(rf"(?<![\w.,]){NUMBER}")  # excludes the end of a name or of a version
+FREE_NUMBER = re.compile(rf"(?<![\w.,]){NUMBER}")  # excludes the end of names and versions
 _TOLERANCE = re.compile(
     r"exact|range(?: {0}{1} %)?|{0}{1} %|[0-9]+{1}".format("[0-9]{1,2}", r"(?:\.[0-9]+)?")
-)  # less than 100 %, since a tolerance of 100 % would accept any published number that is too large
+)  # N % is below 100 %, which would accept every published number that is too large
 _NEEDS = ("module", "program", "variable", "file")
 
 
@@ -47,14 +47,15 @@ class PublishedLine:
             row of the table, the row's value in `rows` replaces it. In `NAME_…`, the value has `_`
             in place of `-`; the final `_` stays.
         rows: label of a row → value that replaces the word; empty: all rows, with their labels.
-        columns: head → expression.
+        columns: text of the header → expression.
         tolerance: `exact` (equal in the digits of the page); `N %` of the published number; `N`;
             `range` (measured values lie between the two published numbers); `range N %` (the range
             is wider by N % on both sides).
         needs: requirements: `module:NAME`, `program:NAME`, `variable:NAME` of the environment, or
             `file:WORD`, where WORD is a word of the command that `--file` replaces.
         minutes: how long the command takes.
-        quick: whether `--quick` repeats the line: within seconds, equal bytes on every machine.
+        quick: whether `--quick` repeats the line. Its command must end within seconds, and its
+            result must have the same bytes on every machine.
         quick_rows: labels of the rows that `--quick` repeats.
         by_hand: why no command can repeat these numbers; the line is then shown and not run.
     """

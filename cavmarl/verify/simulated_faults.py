@@ -24,7 +24,7 @@ JUMP_S = 0.3  # longest jump of a clock
 NODE_KINDS = (FrameKind.REPORT, FrameKind.MESSAGES, FrameKind.SHARE, FrameKind.KEEP)
 RECOVERY_KINDS = (FrameKind.SYNC, FrameKind.REPORT, FrameKind.GIVE, FrameKind.MISSED)
 CALLER_KINDS = (FrameKind.COMMAND, FrameKind.RECOVER)
-LATER_FRAMES = 4  # a process dies in one of its next frames of a kind; largest number of these
+LATER_FRAMES = 4  # a process dies while it sends one of its next `LATER_FRAMES` frames of a kind
 
 
 class Fault(StrEnum):
@@ -76,7 +76,7 @@ TOLERATED_RATES: Mapping[Fault, float] = {
 SEVERE_RATES: Mapping[Fault, float] = dict.fromkeys(SEVERE, 3e-4) | dict.fromkeys(
     NODE_DEATHS, 1.5e-3
 )
-# Severe faults drawn by rate are up to a second apart, so that worlds recover from most of them.
+# Range of the pause after a severe fault drawn by rate, so that worlds recover from most of them.
 # Tolerated faults are short, so that even many of them stay below the time limits.
 SEVERE_APART_S = (0.0, 1.0)
 SHORT_DELAY_S = 0.01

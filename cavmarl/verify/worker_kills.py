@@ -40,8 +40,10 @@ class Kill:
     cause: str  # cause of the death, according to the pool
     # from the signal (idle worker: from its next command) until the pool noticed the death
     noticed_ms: float
-    replaced_ms: float  # from then until the successor had received the command
-    recovered_ms: float  # from the same moment until the successor had completed it
+    # from when the pool noticed the death until the successor had received the command
+    replaced_ms: float
+    # from when the pool noticed the death until the successor had completed the command
+    recovered_ms: float
 
 
 @dataclass(frozen=True)

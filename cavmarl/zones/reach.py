@@ -25,9 +25,10 @@ def driving_reach_m(network: RoadNetwork, travel: TripTables) -> float:
     """Return the distance of the farthest vehicle on which a driver's decision can depend.
 
     A driver looks `view_m` ahead. On a junction, or with a stop line within `see_m`, it also
-    considers vehicles that approach the junction and vehicles after it. Vehicles approach if they
-    are within `APPROACH_M` of the end of a lane that leads to the junction or is on it; where
-    vehicles turn into a lane, the limit is `MERGES_M`. After the junction, it is `EXIT_LOOK_M`.
+    considers vehicles that approach the junction and vehicles after it. A vehicle approaches if it
+    is on the junction, or on a lane that leads to the junction, at most `APPROACH_M` before the end
+    of its lane (`MERGES_M` where vehicles turn into a lane). Vehicles after the junction count up
+    to `EXIT_LOOK_M`.
     """
     longest_m = float(network.links["length_m"].max(initial=0.0))
     junction_m = max(travel.see_m, longest_m)

@@ -448,7 +448,7 @@ def test_the_sender_of_a_wrong_count_of_vehicles_is_lost(monkeypatch: pytest.Mon
         return True
 
     check(
-        monkeypatch, FrameKind.REPORT, change_report(one_more_vehicle), "or epochs differ",
+        monkeypatch, FrameKind.REPORT, change_report(one_more_vehicle), "ids or epochs differ",
         **{"zones.check_invariants": True},
     )  # fmt: skip
 

@@ -110,7 +110,7 @@ class Coordinator(ABC):
     @abstractmethod
     def begin(
         self,
-        check_all: bool,  # check all rows, because rows have changed since ghosts were renewed
+        check_all: bool,  # whether rows have changed since ghosts were renewed: check all rows
         inputs: bytes = b"",  # digest of the actions
     ) -> None:
         """Decide the owners for the next tick, and move rows between owners.

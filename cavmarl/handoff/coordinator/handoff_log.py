@@ -60,9 +60,9 @@ class HandoffLog:
 
     def hand_over(
         self,
-        check_all: bool,  # check all rows, because rows have changed since ghosts were renewed
+        check_all: bool,  # whether rows have changed since ghosts were renewed: check all rows
         vehicles: int,  # expected number of vehicles
-        newborn: Sequence[Birth],  # vehicles that entered since the last BEGIN keep their owner
+        newborn: Sequence[Birth],  # entered since the last BEGIN; these vehicles keep their owner
     ) -> int:  # number of changes
         """Change the owners of vehicles that have crossed a border, according to committed rows.
 

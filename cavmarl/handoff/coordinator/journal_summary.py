@@ -28,7 +28,7 @@ class JournalSummary:
     forced: int = 0  # changes of owner with attached state, since the target was not ready in time
     deferrals: int = 0  # ticks that vehicles spent with an owner whose zone they had left, summed
     hosts: int = 0  # assignments of a zone to a process
-    fences: int = 0  # processes that were fenced
+    fences: int = 0  # processes that were fenced: their messages are dropped
     unfinished: int = -1  # the tick that was begun but not committed; -1: none
     torn: str = ""  # an incomplete last line; empty: none
 
@@ -106,5 +106,5 @@ def _zones(path: Path) -> set[int]:
         if isinstance(record, Host):
             zones.add(record.zone)
     if not reader.lines:
-        raise JournalError(f"{path}: the journal has no complete line; use one with a run")
+        raise JournalError(f"{path}: the journal has no complete line; use the journal of a run")
     return zones

@@ -41,7 +41,8 @@ BLUEPRINTS = {
     "lidar": "sensor.lidar.ray_cast",
     "radar": "sensor.other.radar",
 }
-_NOT_GIVEN = ("bev_grid",)  # CARLA has no frames for these; cavmarl computes imu, gnss and so on
+# types that are refused, since CARLA has no frames for them; cavmarl computes imu, gnss and so on
+_NOT_GIVEN = ("bev_grid",)
 MOST_RADAR_DEG = 179.0  # field of view of CARLA's radars
 _RADAR_HEIGHT_DEG = 0.1  # CARLA's radars scan a cone, but a rig's radars scan a plane
 # CARLA's lidar gets two columns per ray of the rig; only every other column lies on a ray.

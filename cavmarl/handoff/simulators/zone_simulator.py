@@ -48,7 +48,7 @@ class ZoneSetup(NamedTuple):
 class ZoneSimulator(Protocol):
     """Another simulator that moves the vehicles of one zone of one world.
 
-    Calls raise any exception if the simulator cannot go on; the world then ends with a
+    A call may raise any exception if the simulator cannot go on. The world then ends with a
     `ZoneSimulatorError`, or cavmarl takes the zone back. Vehicles are records
     `driving.vehicles.VEHICLE`.
     """

@@ -10,7 +10,7 @@ from cavmarl.core.errors import WorkerError, require
 from cavmarl.parallel.network.ray_cluster import choose_nodes, join, leave, nodes_with
 
 END_S = 3.0  # time for actors to return: Ray prints an error for each killed actor
-SPARES = 1  # spare actors, which replace dead actors at once; starting an actor takes seconds
+SPARES = 1  # number of spare actors, which replace dead actors at once; a start takes seconds
 
 Main = Callable[[tuple[str, int], bytes, int], None]
 

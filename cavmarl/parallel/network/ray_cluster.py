@@ -16,7 +16,8 @@ ADDRESS = "RAY_ADDRESS"  # environment variable that Ray itself reads
 CALL_S = 5.0
 RELEASE_S = 2.0  # time to wait for CPUs, since Ray notices the end of an actor with a delay
 _RESOURCES = ("CPU", "memory", "GPU")
-_joined = 0  # calls of `join` without their `leave`; 0 if the program itself has joined
+# number of calls of `join` that no `leave` has undone; 0 if the program itself has joined
+_joined = 0
 
 
 @dataclass(frozen=True)
@@ -103,11 +104,13 @@ def nodes_with(cpus: int) -> list[Node]:
 
 
 def choose_nodes(known: Sequence[Node], workers: int) -> list[str]:  # names of nodes
-    """Choose an admissible node for each actor: the lowest LoadScore, then the fewest actors.
+    """Choose for each actor the admissible node with the lowest LoadScore.
+
+    On a tie, the node with the fewest actors is chosen.
 
     Raises:
         ConfigError: there are too few free CPUs.
-        NoAdmissibleWorkerError: the other free CPUs are on nodes that are too busy.
+        NoAdmissibleWorkerError: too many of the free CPUs are on nodes that are too busy.
     """
     free = sum(node.cpus for node in known)
     if workers > free:

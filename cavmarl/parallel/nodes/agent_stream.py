@@ -82,10 +82,10 @@ class AgentStream:
 
     def packed(
         self,
-        present: Flags,  # (W, A) agents that have sensed in this node
+        present: Flags,  # (W, A) agents for which this node has sensed
         chosen: Flags,  # (W,) worlds whose agents are sent
         number: int,  # number of this node
-        own: Flags,  # (W, A) output: agents that sensed here last
+        own: Flags,  # (W, A) output: agents for which this node sensed last
         owner: NDArray[np.int32],  # (W · A,) output: node of each agent
     ) -> Bytes:
         """Return a frame about the agents of this node, valid until the next call."""
@@ -137,9 +137,9 @@ class ResultStream:
 
     def packed(
         self,
-        own: Flags,  # (W, A) agents that have sensed in this node
+        own: Flags,  # (W, A) agents for which this node has sensed
         chosen: Flags,  # (W,) worlds that were reset or stepped
-        before: Flags,  # (W, A) agents that had sensed here before the autoreset
+        before: Flags,  # (W, A) `own` before the autoreset
         of_step: bool,
         with_common: bool,  # include the results that all nodes share
     ) -> Bytes:

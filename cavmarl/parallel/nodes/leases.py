@@ -23,7 +23,7 @@ def leases_of(ticks: int, lease: int) -> int:
 
 
 def late_ticks(config: EnvConfig) -> int:
-    """Return the number of ticks, beyond one, for which a zone may keep a vehicle that has left it.
+    """Return for how many ticks a zone may keep a vehicle after the tick in which it left the zone.
 
     Simulators of zones may refuse the vehicle for `zones.max_deferred_ticks` leases.
     """

@@ -57,7 +57,7 @@ class _World:
         self.movers: list[tuple[int, int]] = []
         self.births: list[Birth] = []
         self.answered: set[tuple[int, int]] = set()
-        self.refused: set[tuple[int, int]] = set()  # part of `answered`
+        self.refused: set[tuple[int, int]] = set()  # refused offers, a part of `answered`
         self.has_stepped = False  # whether each zone has received a STEP in the current episode
         self.has_begun = False  # whether the first reset is done; before, rows have no episode
         self.on_record = OwnersOnRecord(zones, limits) if is_checked else None
@@ -79,7 +79,8 @@ class _World:
             if (num, total) != (due[zone], sums[zone]):
                 raise ZonesError(
                     f"world {w}, tick {self.directory.table.tick}: zone {zone} has {num} vehicles, "
-                    f"the records {due[zone]}, or epochs differ; zones.journal shows the records",
+                    f"and {due[zone]} according to the records; if the numbers are equal, ids or "
+                    "epochs differ; zones.journal shows the records",
                     (zone,),
                 )
 
@@ -306,7 +307,9 @@ class NodeCoordinator:
         is_usual = self._has_recovered or 2 * sum(began.values()) > len(began)
         for number, has_begun in began.items():
             if has_begun != is_usual:
-                raise LinkLostError(number, MessageError(f"an episode has begun: {has_begun}"))
+                raise LinkLostError(
+                    number, MessageError(f"it wrongly reports: an episode has begun: {has_begun}")
+                )
 
     def _check_owned(self, w: int, world: _World, reports: Sequence[Report]) -> None:
         """Compare the vehicles that each zone owns according to its rows with the records.
@@ -408,7 +411,7 @@ class NodeCoordinator:
         ]
 
     def lease(self, messages: Mapping[int, bytes], ticks: int) -> None:
-        """Send leases that `begin` returned; `ticks`: 0 for leases of 0 ticks, else 1 or more."""
+        """Send leases that `begin` returned; `ticks`: 0 for leases of 0 ticks; else above 0."""
         for node, data in messages.items():
             self._links.send(node, FrameKind.LEASE, ticks, [data])
 

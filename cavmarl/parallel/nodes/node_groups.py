@@ -255,7 +255,7 @@ def check_groups(world: World) -> None:
     if config.workers.monitor_cpu:
         raise ConfigError(
             "workers.monitor_cpu = True: whole worlds on nodes are balanced by their costs only; "
-            "leave it out, or use backend='processes:N' or more nodes than worlds"
+            "leave out workers.monitor_cpu, or use backend='processes:N' or more nodes than worlds"
         )
     check_nodes(world, 1)
     if config.workers.balance_steps and config.zones.journal:

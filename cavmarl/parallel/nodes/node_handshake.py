@@ -65,5 +65,6 @@ def call_node(
     """
     try:
         return system.open(place, secret, caller_number(number, generation), ANSWER_S)
-    except (OSError, EOFError, MessageError, ValueError) as error:  # `place` may have any value
+    # A node has reported `place`, so it may have any value.
+    except (OSError, EOFError, MessageError, ValueError) as error:
         raise LinkLostError(of) from error

@@ -61,7 +61,7 @@ class MachineWatch:
 
 
 def _watch(pids: Sequence[int]) -> Watch:
-    """Watch processes, starting with this process."""
+    """Watch this process and these processes."""
     return Watch(dict(enumerate(dict.fromkeys((os.getpid(), *pids)))))
 
 

@@ -40,7 +40,10 @@ PIECES = ("terms", "terminated", "present", "acted", "events", "vehicle_ids", "p
 
 
 class NodePeers(Peers):
-    """Exchanges shares, the data of parts of a tick: for each, every two nodes swap one frame.
+    """Exchanges shares with the other nodes.
+
+    A share is the data of a part of a tick. For each share, each node sends one frame to each other
+    node.
 
     Attributes:
         own: (W, A) agents for which this node sensed last.
@@ -109,7 +112,8 @@ class NodePeers(Peers):
             zoned.num_outer[zone, chosen] = -1
         for zone in range(len(zoned.num_rows)):
             for w in np.flatnonzero(chosen).tolist():
-                num = zoned.num_rows.item(zone, w)  # the first zone had all vehicles
+                # The first zone had all vehicles, so it has rows beyond its present number of rows.
+                num = zoned.num_rows.item(zone, w)
                 for array in (*zoned.rows[:, zone, w], *(each[zone, w] for each in self._of_rows)):
                     forget(array[num:])
         self._rerouted[chosen] = 0

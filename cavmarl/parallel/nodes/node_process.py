@@ -99,7 +99,7 @@ class NodeProgram:
         self._synchronized: set[int] = set()  # nodes whose SYNC of this generation has arrived
         # world, vehicle and zone of each offer that was answered recently
         self._answered: list[tuple[int, int, int]] = []
-        # node → fault in one of its frames, kept because an earlier report of it may be void
+        # node → fault in one of its frames, kept for the next report: earlier reports may be void
         self._faults: dict[int, str] = {}
         self._witness: int | None = None  # node that claims that a recovery is ordered
         self._actions: deque[NodeFrame] = deque()  # forwarded actions

@@ -91,7 +91,7 @@ class NodeSupply:
         """Return ready nodes with their connections.
 
         Args:
-            num: the number of nodes; without waiting, the maximum.
+            num: the number of nodes; if `waits` is false, there may be fewer.
             trouble: called while nodes are awaited.
             waits: whether to wait for the nodes.
 

@@ -101,8 +101,8 @@ class NodeWatch:
                 for offer in sorted(error.offers & before.offers if before else ()):
                     raise self._without_answer(offer) from error
         raise WorkerError(
-            f"{silence}, {VAIN} times, although all nodes are alive; raise workers.timeout_s = "
-            f"{timeout_s:g}"
+            f"{silence}; this happened {VAIN} times in a row, although all nodes are alive; "
+            f"raise workers.timeout_s = {timeout_s:g}"
         ) from silence
 
     def _wait(self, timeout_s: float, wait: Callable[[float], Found]) -> Found:
@@ -169,9 +169,10 @@ class NodeWatch:
     def most_missed(self, lost: LinkLostError, generation: int) -> LinkLostError:
         """Return the node that is lost, after nodes have reported lost connections.
 
-        If a node has ended, it is the lost node; otherwise, the node that has sent bad frames to
-        most nodes; without bad frames, the node that most nodes cannot reach. If two nodes cannot
-        reach each other, either may be at fault, so they count as lost in turn.
+        If a node has ended, it is the lost node. Otherwise, if there were bad frames, the node that
+        has sent bad frames to the most nodes is lost. Otherwise, the node that the most nodes
+        cannot reach is lost. If two nodes cannot reach each other, either may be at fault. So the
+        node that counts as lost alternates with `generation`.
 
         Args:
             lost: the first report.

@@ -476,5 +476,5 @@ def check_nodes(world: World, nodes: int) -> None:
     if config.workers.monitor_cpu and not config.workers.balance_steps:
         raise ConfigError(
             "workers.monitor_cpu = True: nodes watch their machines for balancing only; set "
-            "workers.balance_steps, or leave it out"
+            "workers.balance_steps, or leave out workers.monitor_cpu"
         )

@@ -111,7 +111,8 @@ class ZoneEndpoints(OwnershipRuntime):
         # world, vehicle → node that has offered it last
         self._sources: dict[tuple[int, int], int] = {}
         self._division, self._checks = division, checks
-        self._answered, self._num_answered = answered, 0  # entries before the current lease
+        # `_num_answered`: number of entries of `answered` from before the current lease
+        self._answered, self._num_answered = answered, 0
         answered.clear()
         self._zones = frozenset(zones)
         self._node_of = node_of

@@ -71,7 +71,7 @@ def read_backend(
     """Return the backend that the arguments name; they have to agree.
 
     Args:
-        backend: one of `FORMS`; None: as in the short forms, by default `local`.
+        backend: one of `FORMS`; None: the backend of the short form, or else `local`.
         workers: short form: N for `processes:N`, 0 for `local`.
         nodes: short form: N for `nodes:N`.
         registered: names of registered backends.
@@ -142,6 +142,6 @@ def _number(name: str, value: object, least: int) -> int:
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
         raise ConfigError(f"{name} = {value!r}: must be a whole number")
     if value < least:
-        cure = "leave it out for this process" if least else "use 0 for this process"
+        cure = "leave it out to run in this process" if least else "use 0 to run in this process"
         raise ConfigError(f"{name} = {value}: must be a number from {least}; {cure}")
     return int(value)

@@ -20,7 +20,7 @@ def homes(
     cores: Sequence[int],  # core where each process was seen
     usable: set[int],
 ) -> list[int]:  # different cores; empty if there are too few
-    """Choose each process's core: where it was seen, unless an earlier process has that core."""
+    """Choose for each process the core where it was seen, or a free core if that one is taken."""
     free = sorted(usable - set(cores))
     found: list[int] = []
     for core in cores:

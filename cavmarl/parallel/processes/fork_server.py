@@ -20,7 +20,7 @@ from cavmarl.parallel.processes.process_barrier import WAKE
 from cavmarl.parallel.processes.watchdog import CHECK_S, STOPPED_CHECKS, is_stopped
 from cavmarl.parallel.processes.worker_loop import MAIL, MAX_MESSAGE
 
-ANSWER_MS = 2_000  # time to fork or reap; a server that takes longer must be stopped or broken
+ANSWER_MS = 2_000  # time to fork or reap; a server that takes longer counts as stopped or broken
 END_S = 1.0  # time for the server and its workers to end
 
 # One thread per worker: the processes themselves share the cores.

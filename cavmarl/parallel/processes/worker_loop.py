@@ -240,10 +240,14 @@ def _run_commands(job: Job, wake_signal: WakeSignal, slots: Sequence[Image]) -> 
 def _await(
     wake_signal: WakeSignal,  # shared with the pool
     order: int,  # number of the command
-    last_s: float,  # duration of the last wait for a command that had not arrived
+    last_s: float,  # duration of the last wait
     work_s: float,  # duration of the work since then
-) -> float:  # duration of the last such wait, possibly this one
-    """Wait for a command; exit if the pool is closed."""
+) -> float:
+    """Wait for a command; exit if the pool is closed.
+
+    Returns:
+        the duration of the wait; `last_s` if the command had arrived before.
+    """
     if wake_signal.has(order):
         return last_s
     began = time.perf_counter()

@@ -186,7 +186,7 @@ class Pool:
             suspects = dict.fromkeys(dead, "") or guard.hanging(pending)
             suspected = {k: self._processes.processes[k] for k in suspects} | dead
             for k, cause in suspects.items():
-                if self._processes.processes[k] is suspected[k]:  # not replaced with its team
+                if self._processes.processes[k] is suspected[k]:  # still the hung or dead process
                     self._replace(k, cause, mail)
             pending = self._pending()
             for k in pending:

@@ -138,7 +138,7 @@ class SensorWorkers:
         return self._costs_s.copy()
 
     def __call__(self, scenes: Sequence[SensedScene], turns: Sequence[Turn]) -> None:
-        """Write the samples of all turns, each the work of one sensor in this tick."""
+        """Write the samples of all turns; a turn is the work of one sensor in this tick."""
         theirs = [turn for turn in turns if not turn.sensor.stamps_itself]
         if not theirs:
             sense_here(scenes, turns)
@@ -212,8 +212,8 @@ class SensorWorkers:
             for worker, world in np.argwhere(wrong[:, turn.place]).tolist():
                 found = shared.delivered[worker, turn.place, world]
                 raise WorkerError(
-                    f"rig.{turn.sensor.name}: the frame of tick {shared.ticks[world]} is missing, "
-                    f"there is one of tick {found}; use sensor_workers=0"
+                    f"rig.{turn.sensor.name}: the frame of tick {shared.ticks[world]} is missing; "
+                    f"the worker's newest frame is of tick {found}; use sensor_workers=0"
                 )
 
     def _share(self, sensors: tuple[int, ...]) -> _Sharing:

@@ -24,8 +24,10 @@ from cavmarl.balance.problem import Problem, ShardCost
 from cavmarl.balance.shard_placement import Placement
 from cavmarl.parallel.sensor_workers.line_costs import LineCosts
 
-PIECES_PER_WORKER = 4  # units of one sensor, if there are enough agents
-MIN_GAIN_S = 2e-4  # smaller gains do not pay for looking up the same surroundings in two workers
+PIECES_PER_WORKER = 4  # number of units of one sensor per worker, if there are enough agents
+# A frame is divided only if this saves at least this time, since both workers then look up the same
+# surroundings.
+MIN_GAIN_S = 2e-4
 
 
 class Unit(NamedTuple):
@@ -59,7 +61,8 @@ class Shares:
     def divided(self) -> dict[int, list[tuple[int, tuple[int, int]]]]:
         """Worker and lines of each part, for each sensor that is divided equally for all agents.
 
-        The time that a worker spends on other sensors cannot be attributed to lines.
+        Other sensors are left out: measured times of whole frames, or of different divisions,
+        cannot be attributed to lines.
         """
         parts: dict[int, list[tuple[int, tuple[int, int]]]] = {}
         agents: dict[int, set[tuple[int, int]]] = {}

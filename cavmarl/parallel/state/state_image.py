@@ -39,7 +39,7 @@ class Image:
         self._begin = 0  # word at which the first array starts
         self._places: list[_Place] = []
         self._written: Arrays = ()  # arrays of the last `write`
-        self._copies: list[tuple[Array, Array]] = []  # target, source
+        self._copies: list[tuple[Array, Array]] = []  # (target, source) of each copy
 
     def write(self, arrays: Arrays) -> None:
         """Copy arrays into the image; dtypes must not change from call to call.

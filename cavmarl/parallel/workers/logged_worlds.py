@@ -25,8 +25,8 @@ class LoggedWorlds(WorkerWorlds):
         worlds: LocalWorlds,
         first: int,
         checkpoint_log: CheckpointLog,
-        # whether `MAX_REPEAT_S` limits the log. Each step of a world that a team runs takes long,
-        # and an image takes almost as long, so only the number of steps limits its log.
+        # whether `MAX_REPEAT_S` limits the log. If a team runs the world, a step takes long, and an
+        # image takes almost as long, so the log is limited only by the number of steps.
         limits_repeat: bool,
     ) -> None:
         super().__init__(worlds, first)

@@ -47,7 +47,8 @@ class PooledWorlds(CommandedWorlds):
         world: World,
         base_dir: Path,  # folder of relative paths
         num_worlds: int,  # W
-        workers: int,  # m, from 1 to W times the zones of a world; more than W divide the worlds
+        # m, from 1 to W times the number of zones of a world; above W, workers share worlds
+        workers: int,
         in_next_step: bool = False,  # whether new episodes start a step later; see `SteppedWorlds`
         program: str | None = None,  # module that the processes run; None: `job_factory`
     ) -> None:

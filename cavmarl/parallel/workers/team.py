@@ -38,8 +38,8 @@ from cavmarl.shards.phases import Phase
 from cavmarl.shards.shard import Commands, Shard
 from cavmarl.shards.shard_group import ShardGroup
 
-# Words of the leader's line, after the words of `process_barrier`: for calls with even numbers, and
-# for calls with odd numbers.
+# Words of the leader's line, after the words of `process_barrier`. The first word announces calls
+# with even numbers, the second word announces calls with odd numbers.
 CALLS = (2, 3)
 # A word of a member's line.
 FAILED = 2
@@ -214,10 +214,10 @@ class TeamMember:
         self._own.host(zones)
 
     def _leave_shared_core(self) -> None:
-        """Leave the core of a member with a lower number; the members would wait for each other.
+        """Move to another core if a member with a lower number uses the same core.
 
-        Operating systems put processes that wake together on one core, and take milliseconds to
-        separate them.
+        Otherwise, one of the two members would wait for the other. Operating systems put processes
+        that wake together on one core, and take milliseconds to separate them.
         """
         core = present_core()
         taken = {line.item(CORE) for line in self._before}

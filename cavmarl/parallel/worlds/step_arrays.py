@@ -31,14 +31,15 @@ FINAL_FRAMES = "final_rig."  # prefix of the names of final frames in a layout
 class StepArrays(NamedTuple):
     """Arrays of W worlds with A agents each, which every step overwrites.
 
-    T is the number of terms, D the size of a flat observation, S the size of a global state.
+    T is the number of terms, D the size of a flat observation, and S the number of agents of
+    signals or of speed limits (`RoadsideAgents`).
     """
 
     observations: NDArray[np.float32]  # (W, A, D) for the next action
-    final_observations: NDArray[np.float32]  # (W, A, D) last of an agent or episode that ended
+    final_observations: NDArray[np.float32]  # (W, A, D) last of agents and episodes that ended
     rewards: NDArray[np.float32]  # (W, A)
-    terminations: NDArray[np.bool_]  # (W, A) the vehicle has left
-    # (W, A) the horizon of the episode or of the trip was reached; a trip ends with its vehicle
+    terminations: NDArray[np.bool_]  # (W, A) the agent's vehicle has left the world
+    # (W, A) the horizon of the episode, or of the trip (the vehicle then leaves), was reached
     truncations: NDArray[np.bool_]
     acted: NDArray[np.bool_]  # (W, A) agents that acted in the step
     vehicle_done: NDArray[np.bool_]  # (W, A) the trip of the agent's vehicle has ended
@@ -56,7 +57,7 @@ class StepArrays(NamedTuple):
     external: NDArray[np.float64]  # (W, E, K)
     overridden: NDArray[np.int32]  # (W, N, 2)
     lane_changes: NDArray[np.float64]  # (W, N, 3)
-    # Arrays of S agents of signals or of speed limits (`RoadsideAgents`):
+    # Arrays of agents of signals or of speed limits:
     signal_choices: NDArray[np.int64]  # (W, S)
     signal_observations: NDArray[np.float32]  # (W, S, D) see `SignalOutputs`, also for the next 8
     signal_rewards: NDArray[np.float32]  # (W, S)
@@ -67,9 +68,9 @@ class StepArrays(NamedTuple):
     signal_states: NDArray[np.int64]  # (W, S, HELD)
     signal_history: NDArray[np.int64]  # (W, N, HISTORY)
     signal_loops: NDArray[np.int64]  # (W, N, 2, READINGS)
-    final_signal_observations: NDArray[np.float32]  # (W, S, D) last of an episode that ended
+    final_signal_observations: NDArray[np.float32]  # (W, S, D) last of episodes that ended
     suggested: NDArray[np.float64]  # (W, A, 2) actions of the built-in driver
-    states: NDArray[np.float32]  # (W, S) global states at the last request
+    states: NDArray[np.float32]  # (W, size) global states at the last request
     frames: Frames  # frames of mounted sensors
     final_frames: Frames  # last frames of an agent or episode that ended
 

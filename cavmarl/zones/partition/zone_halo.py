@@ -1,4 +1,4 @@
-"""Halos: the areas beyond their borders that zones see.
+"""Halos: the areas that zones see beyond their borders.
 
 A halo is a distance (decision 012): zones can receive ghosts of vehicles within this distance, even
 from zones that do not touch them. `Visibility` leaves out vehicles that no driver considers.

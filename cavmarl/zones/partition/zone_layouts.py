@@ -159,9 +159,9 @@ def _bisected(area: _Area, rect: Rect, samples: Floats | None, count: int) -> li
 def _window(
     rect: Rect, samples: Floats | None, axis: int, share: float
 ) -> tuple[float, float, float] | None:
-    """Return the first allowed, the wanted (`share` of the weight below) and the last allowed cut.
+    """Return three cuts: the first allowed cut, the wanted cut, and the last allowed cut.
 
-    Return None if no cut is allowed.
+    The wanted cut has the `share` of the weight below it. Return None if no cut is allowed.
     """
     low, high = rect[axis] + MIN_SIDE_M, rect[axis + 2] - MIN_SIDE_M
     shift = _WEIGHT_SHIFT * min(share, 1.0 - share)

@@ -32,7 +32,7 @@ def zones_without_loop(network: RoadNetwork, partition: ZonePartition) -> tuple[
 def _of_links(
     network: RoadNetwork, ufunc: np.ufunc, of_lanes: NDArray[np.int32]
 ) -> NDArray[np.int32]:
-    """Return the smallest or largest zone on each link and on the edges before and after it."""
+    """Return the lowest or highest zone number on each link and the edges before and after it."""
     lanes, links = network.lanes, network.links
     of_edges = ufunc.reduceat(of_lanes, network.edges["first_lane"])
     from_edge, to_edge = (lanes["edge"][links[end]] for end in ("from_lane", "to_lane"))
