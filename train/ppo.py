@@ -332,7 +332,8 @@ class Learner:
         chosen = self._filtered(advantages, acted, self.imitation_weight(left) > 0.0)
         if reluctant is not None:
             held = acted[reluctant[acted]]
-            output = network(batch.observations.flatten(0, 2)[held]).detach()
+            with torch.no_grad():
+                output = network(batch.observations.flatten(0, 2)[held])
             learned = torch.zeros_like(reluctant)
             learned[chosen] = learned[held[is_held_back(output)]] = True
             chosen = learned.nonzero().squeeze(1)

@@ -367,7 +367,7 @@ class ConflictsConfig(
             indicate at their present or next junction. It also adds this turn as a feature.
         indicators_m: distance to the junction from which vehicles indicate; before that, their turn
             is unknown. 0: they indicate at any distance, as read from the world's state.
-        horizon_s: time for which motion is predicted, in steps of 0.5 s.
+        horizon_s: time for which motion is predicted; a multiple of 0.5 s.
         departs: false assumes that the ego vehicle keeps its speed, but drives at least 3 m/s. True
             assumes that it accelerates with 2 m/s² to the speed limit of its lane.
     """
@@ -380,6 +380,11 @@ class ConflictsConfig(
     indicators_m: Annotated[float, Within(0.0, 300.0)] = 0.0
     horizon_s: Annotated[float, Within(0.5, 15.0)] = 4.5
     departs: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        halves = 2.0 * self.horizon_s
+        self.need("horizon_s", halves == round(halves), "must be a multiple of 0.5")
 
 
 @dataclass(frozen=True)

@@ -326,6 +326,11 @@ def test_invalid_distances_are_refused(wrong: tuple[float, ...]) -> None:
         WayConfig(distances_m=wrong)
 
 
+def test_a_horizon_between_two_predictions_is_refused() -> None:
+    with pytest.raises(cavmarl.ConfigError, match=r"horizon_s = 4\.7: must be a multiple of 0\.5"):
+        ConflictsConfig(count=1, horizon_s=4.7)
+
+
 def test_settings_without_sight_omit_sensors_of_vehicles_and_lines() -> None:
     config = SensorsConfig(
         way=WayConfig(distances_m=(5.0,), lines=2),
