@@ -87,19 +87,21 @@ def make_aec(arguments: dict[str, Any]) -> Make:
 # An episode can end before all possible agents have entered.
 @pytest.mark.filterwarnings("ignore:No agents present but not all possible_agents")
 @worlds(*sorted(entries()), *BARE_MAPS)
-def test_parallel_api(make: Make) -> None:
+def test_environments_pass_parallel_api_test(make: Make) -> None:
     parallel_api_test(make(), num_cycles=STEPS)
 
 
 # An agent without a vehicle observes zeros.
 @pytest.mark.filterwarnings("ignore:Observation numpy array is all zeros")
 @in_few_worlds
-def test_aec_api(make_aec: Make) -> None:
+def test_environments_pass_api_test(make_aec: Make) -> None:
     api_test(make_aec(), num_cycles=STEPS)
 
 
 @in_few_worlds
-def test_max_cycles(arguments: dict[str, Any], make: Make, make_aec: Make) -> None:
+def test_environments_pass_max_cycles_test(
+    arguments: dict[str, Any], make: Make, make_aec: Make
+) -> None:
     # PettingZoo's test expects most possible agents to act until the end. So all agents enter at
     # the reset, and small steering angles keep them on the road.
     few = {"population.budget": arguments["agents"], "action.steering_rad": 0.05}
@@ -112,12 +114,12 @@ def test_max_cycles(arguments: dict[str, Any], make: Make, make_aec: Make) -> No
 
 
 @in_few_worlds
-def test_state(make: Make, make_aec: Make) -> None:
+def test_environments_pass_state_test(make: Make, make_aec: Make) -> None:
     state_test(make_aec(), make(), num_cycles=STEPS)
 
 
 @worlds(bare=())  # without bare maps
-def test_render(make_aec: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_environments_pass_render_test(make_aec: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pygame", reason="frames need the extra 'render'")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     render_test(make_aec)

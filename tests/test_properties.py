@@ -94,7 +94,7 @@ SMALL = {"population.agents": 2, "population.background": 2}
 
 @settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
 @given(pairs=st.lists(NEAR | NEAR | NEAR | STRANGE, min_size=1, max_size=3))
-def test_any_configuration_is_a_world_or_is_refused(pairs: list[tuple[str, Any]]) -> None:
+def test_any_configuration_makes_a_world_or_is_refused(pairs: list[tuple[str, Any]]) -> None:
     with TemporaryDirectory() as room, chdir(room):  # journals are written there
         try:
             env = parallel_env("ring", seed=0, overrides=SMALL | dict(pairs))

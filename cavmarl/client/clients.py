@@ -131,11 +131,11 @@ class Client:
             needs: capabilities that the node must have.
             wait_s: longest wait for a node in s.
             recovery_s: longest search in s for another node after a loss.
-            keys: `zones`, `nodes`, `agents`, `background`, `max_cycles`, `num_envs`, `seed` and
-                `overrides` as in `make_vec`; `nodes` is a number of nodes of the service; `name`:
-                name under which the service numbers the versions of the configuration; `drivers`:
-                folders of your trained drivers, by the names that `traffic.model` and `policies`
-                use; `licence`: licence of your files, as text.
+            keys: `zones`, `agents`, `background`, `max_cycles`, `num_envs`, `seed` and `overrides`,
+                as in `make_vec`. `nodes`: number of nodes of the service that host the zones.
+                `name`: name under which the service numbers the versions of the configuration.
+                `drivers`: folders of your trained drivers, by the names that `traffic.model` and
+                `policies` use. `licence`: licence of your files, as text.
 
         Raises:
             ServiceError: the request was refused; `problem` names the reason.

@@ -147,9 +147,9 @@ class Access:
         )  # fmt: skip
 
     def state_token(self, session: SessionRecord, number: int, content: bytes) -> str:
-        """Return the service's signature of a saved state, for the node of its session alone.
+        """Return the service's signature of a saved state, valid only for the node of its session.
 
-        Nodes check it with the public keys. With a shared key, each node could sign, too.
+        Nodes check it with public keys, so no node can sign a state itself.
         """
         return self._sign(
             {"sub": session.id, "aud": f"node:{session.node}", "number": number,

@@ -165,5 +165,5 @@ class GuardedRequests:
         try:
             await self._app(scope, receive_in_time, send_with_headers)
         except Exception as error:
-            if scope.get(FAULT) is not error:  # a fault was logged and answered already
+            if scope.get(FAULT) is not error:  # the fault was logged, and the client has its answer
                 raise

@@ -27,8 +27,8 @@ from cavmarl.service.event_log import EventLog
 from cavmarl.service.service_records import SESSION_OVER, ArtefactRecord, IdentityRecord
 
 T = TypeVar("T")
-MOST_UNPACKED_BYTES = 1 << 29  # maximum content of a compressed file
-MOST_ELEMENTS = 10_000_000  # maximum number in an XML file
+MOST_UNPACKED_BYTES = 1 << 29  # maximum size of a compressed file when unpacked
+MOST_ELEMENTS = 10_000_000  # maximum number of elements in an XML file
 MOST_YAML_BYTES = 1 << 20
 MOST_JSON_BYTES = 1 << 24
 _HEAD_BYTES = 1 << 17
@@ -176,7 +176,7 @@ class Artefacts:
 
 
 def check_content(name: str, sha256: str, content: bytes) -> None:
-    """Check that a file has its hash, and is what the suffix of its name says.
+    """Check that a file has its hash, and that its content fits the suffix of its name.
 
     Raises:
         ServiceError: the hash differs, the suffix belongs to no kind of data, or the content is of
@@ -230,7 +230,7 @@ def _check_root(head: bytes) -> None:
         path = Path(folder) / "file.xml"
         path.write_bytes(head)
         if is_sumo_config(path):
-            raise ValueError("a configuration of SUMO names other files; give these instead")
+            raise ValueError("a configuration of SUMO only names files; upload these files instead")
         if not root_tag(path):
             raise ValueError("it has no root element")
 

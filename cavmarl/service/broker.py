@@ -52,7 +52,7 @@ class BrokerRules:
     idle_s: float = 600.0  # idle time after which a session ends
     keep_s: float = 3600.0  # how long ended sessions can be read
     keep_nodes_s: float = 86_400.0  # how long nodes that are down or have left are kept
-    max_losses: int = 10  # nodes that a job may lose before it fails, without a new saved state
+    max_losses: int = 10  # nodes lost since the last saved state of a job after which the job fails
     max_skew_s: float = 5.0  # tolerated difference of the clocks of a node and of the service
     max_nodes: int = 10_000
     max_sessions: int = 1000  # open sessions of one identity
@@ -331,7 +331,9 @@ class Broker:
         if session is None or node is None or not is_own:
             raise problem("lost", f"session '{number}' is on no node of this identity")
         if session.incarnation != node.incarnation:
-            raise problem("superseded", f"node '{node.name}' has registered again since")
+            raise problem(
+                "superseded", f"node '{node.name}' has registered again since it got this session"
+            )
         return session
 
     def close(self, identity: IdentityRecord, number: str) -> SessionRecord:
@@ -388,7 +390,7 @@ class Broker:
         return self.rules.beat_s * self.rules.missed_beats
 
     def limits_of(self, name: str) -> list[str]:
-        """Return why a node accepts no session now, and what to do; [] if it accepts some."""
+        """Return why a node accepts no session now, with remedies; empty if it accepts sessions."""
         is_old = self.age_s(name) > self._max_age_s
         return limits_of(self.log.state.nodes[name], self.live[name], is_old, self.rules.load)
 

@@ -14,7 +14,8 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 World = Annotated[int, Field(ge=0, lt=1024)]
 Lanes = Annotated[list[Annotated[int, Field(ge=0, lt=MOST_LANES)]], Field(max_length=MOST_LANES)]
 Plain = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_]{1,64}$")]  # never a path
-Table = Literal["observations", "samples", "messages"]  # not "commands": for one world only
+# without "commands": only a single world can be recorded with them
+Table = Literal["observations", "samples", "messages"]
 
 
 class _Change(BaseModel):
@@ -92,7 +93,7 @@ Change = Annotated[
 
 
 class KeptRecording(_Change):
-    """The recording of a session in its saved state; each saved state ends a part of it."""
+    """The data of a recording in a saved state; each saved state ends a part of the recording."""
 
     include: Annotated[list[Table], Field(max_length=3)]
     part: Annotated[int, Field(ge=0, lt=1 << 31)]  # number of the next part

@@ -168,7 +168,7 @@ def _check(document: dict[str, Any], files: Mapping[str, bytes]) -> None:
         raise problem(
             "refused",
             "plugins: name modules, which are code, and cannot be overridden; the service and its "
-            "nodes import those that the env.yaml of their own environment names",
+            "nodes import only the modules that the env.yaml of an installed environment names",
         )
     for text in _texts(document["overrides"]):
         if not _PLAIN.fullmatch(text):

@@ -33,7 +33,7 @@ _Batch = tuple[list[LogEvent], dict[str, bytes], set[str], SignedHead | None, Se
 
 
 class EventLog:
-    """The service records and the only way to change them.
+    """The records of the service, and the only way to change them.
 
     Args:
         store: where events are kept. The events after its snapshot are replayed; call

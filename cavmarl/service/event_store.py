@@ -424,7 +424,7 @@ def _lock_file(path: Path) -> IO[bytes]:
     lock = os.fdopen(handle, "r+b")
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if (names := os.fstat(handle).st_nlink) > 1:  # SQLite names its log after one of them
+        if (names := os.fstat(handle).st_nlink) > 1:  # SQLite names its log after one of the names
             raise ServiceError(f"store {path}: has {names} names; remove its other hard links")
         check_private("store", path)
     except BlockingIOError:

@@ -21,7 +21,7 @@ class JobQueue:
 
     Args:
         log: the event log of the service.
-        choose: returns a node for a session, excluding some.
+        choose: returns a node for a session; arguments: the session, names of excluded nodes.
         assign: assigns a session to a node.
         end: ends a session as `failed`.
         clock_s: the clock for the rate limit.
@@ -87,7 +87,7 @@ class JobQueue:
         for number in list(self._log.state.waiting):
             session = self._log.state.sessions[number]
             if session.losses >= max_losses:
-                self._end(session, f"{session.losses} nodes were lost with it")
+                self._end(session, f"{session.losses} nodes were lost while they ran the job")
                 continue
             waited_s = self._log.wall_s() - session.opened_s
             if session.wait_s is None or session.placements or waited_s <= session.wait_s:
@@ -95,7 +95,7 @@ class JobQueue:
             told = {"of": "job in the queue", "after_s": waited_s}
             self._log.record("session.timeout", number, told, owner=session.owner)
             why = self.reason_of(session) or "no node was free"
-            self._end(session, f"no node took it within {session.wait_s:g} s: {why}")
+            self._end(session, f"no node took the job within {session.wait_s:g} s: {why}")
 
 
 def _kind_of(session: SessionRecord) -> tuple[str, ...]:

@@ -50,7 +50,7 @@ class NodeOptions:
     name: str
     host: str = "127.0.0.1"
     port: int = 0  # port for clients; 0 picks a free port
-    simulator_port: int | None = None  # port that clients connect to; None: `port`
+    simulator_port: int | None = None  # reported to clients, which connect to `port`; None: `port`
     slots: int = 4
     capabilities: tuple[str, ...] = ()
     allowed: tuple[str, ...] = ()

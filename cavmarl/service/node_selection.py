@@ -123,7 +123,7 @@ def choose(
     avoided: Sequence[str] = (),  # nodes that the client cannot reach
     rule: LoadRule = DEFAULT_RULE,
 ) -> Chosen:
-    """Return the admissible node with the lowest score, or the preferred one if about equal.
+    """Return the admissible node with the lowest score, or a preferred node with about this score.
 
     Raises:
         NoNodeError: all nodes are excluded.
@@ -160,7 +160,7 @@ def choose(
 
 
 def limits_of(node: NodeRecord, known: LiveNode, is_old: bool, rule: LoadRule) -> list[str]:
-    """Return why a node would accept no session of a client without needs, and what to do."""
+    """Return why a node would refuse a session that needs no capabilities, and what to do."""
     reason = _state_against(node, known, is_old)
     if reason is not None:
         return [explain(Exclusion(node.name, reason))]

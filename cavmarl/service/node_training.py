@@ -1,4 +1,4 @@
-"""Training jobs on a node: the program in a process of its own, and its run as the job's state.
+"""Training jobs on a node. The program has its own process; its run is the job's saved state.
 
 While the program trains, the node stores the run's last checkpoint with the service. If the node is
 lost or drained, another node continues the run from there.
@@ -28,8 +28,8 @@ from cavmarl.service.training_settings import PROGRAM, RUN, program_options
 
 POLL_S = 0.5  # time between two looks at the program
 STORE_S = 5.0  # shortest time between two states that the service stores
-MOST_RUN_BYTES = 1 << 29  # of the files of a run
-ROW_BYTES = 1 << 14  # of the largest row of a learning curve
+MOST_RUN_BYTES = 1 << 29  # maximum size of the files of a run
+ROW_BYTES = 1 << 14  # maximum size of a row of a learning curve
 
 
 async def train(

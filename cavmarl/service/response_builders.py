@@ -30,7 +30,7 @@ async def assigned(
     take: Callable[[], SessionRecord],
     wait_s: float,
 ) -> response_bodies.Assignment:
-    """Return what a client needs to reach its world; wait for a node until a deadline."""
+    """Return what a client needs to reach its world; wait at most `wait_s` for a node."""
     broker = service.broker
     try:
         session = take()

@@ -50,7 +50,7 @@ class Service:
     def holding(self, identity: IdentityRecord) -> Iterator[None]:
         """Count a stream or a waiting request while it is open; raise `too-many` at the limit."""
         if self.held[identity.id] >= MOST_HELD:
-            detail = f"{MOST_HELD} event streams and waiting requests are yours: end some"
+            detail = f"you have {MOST_HELD} event streams and waiting requests, the limit: end some"
             raise problem("too-many", detail, 5.0)
         self.held[identity.id] += 1
         try:

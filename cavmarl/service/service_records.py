@@ -179,7 +179,8 @@ class Infrastructure:
             kept = {one: until_s for one, until_s in identity.used.items() if until_s > now_s}
             identity.used = kept | {event.data["token"]: event.data["expires_s"]}
             return
-        identity.generation += 1  # `withdrawn`: its tokens are invalid; `revoked`: the identity is
+        # `withdrawn`: the identity's tokens become invalid; `revoked`: the identity itself, too
+        identity.generation += 1
         identity.revoked = identity.revoked or word == "revoked"
 
     def _apply_key(self, word: str, event: LogEvent) -> None:

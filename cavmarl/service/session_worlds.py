@@ -198,7 +198,7 @@ class SessionWorld:
             return self._last
         if number != self.number + 1:
             raise problem(
-                "conflict", f"command {number} follows {self.number}: increase the number by one"
+                "conflict", f"command {number} after {self.number}: numbers must increase by one"
             )
         answer = act()
         self.number, self._last = number, answer

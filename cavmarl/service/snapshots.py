@@ -27,7 +27,7 @@ _RECORDS = (
     Infrastructure, NodeRecord, SessionRecord, OwnerTable, ArtefactRecord, IdentityRecord,
 )  # fmt: skip
 _FIELDS = json.dumps([[one.name for one in fields(record)] for record in _RECORDS])
-# Another version may derive other records from the same events, so it replays them.
+# A service with another schema may derive other records from the events, so it replays them.
 SNAPSHOT_SCHEMA = (
     f"cavmarl.snapshot/1 {version('cavmarl')} {hashlib.sha256(_FIELDS.encode()).hexdigest()[:12]}"
 )

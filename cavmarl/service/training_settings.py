@@ -51,7 +51,7 @@ def check_training(document: Mapping[str, Any], settings: Settings) -> None:
         if name in OF_CONFIGURATION:
             raise problem("refused", f"settings: {name} belongs to the configuration; remove it")
         if name in OF_NODE:
-            raise problem("refused", f"settings: {name} is the node's to choose; remove it")
+            raise problem("refused", f"settings: {name} is chosen by the node; remove it")
         if name not in known:
             there = ", ".join(sorted(known))
             raise problem("refused", f"settings: {name} is unknown; known settings: {there}")

@@ -26,7 +26,7 @@ class ZoneNodes:
     Args:
         log: the event log of the service.
         live: heartbeats of the nodes.
-        choose: returns a node for a session, excluding some.
+        choose: returns a node for a session; arguments: the session, names of excluded nodes.
     """
 
     def __init__(self, log: EventLog, live: Mapping[str, LiveNode], choose: Choose) -> None:

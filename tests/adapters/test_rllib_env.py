@@ -46,7 +46,10 @@ def cluster() -> Iterator[None]:
 
 @pytest.mark.parametrize("mode", MODES)
 def test_rllib_gets_the_results_of_the_world(mode: str) -> None:
-    """Compare with PettingZoo's environment; the test resets RLlib's whenever it ends earlier."""
+    """Compare with PettingZoo's environment.
+
+    RLlib's environment may end earlier; the test then resets it.
+    """
     from cavmarl.adapters.rllib_env import CavRllibEnv
 
     # In the mode "open" with one agent, an agent enters when the last agent's trip has ended.

@@ -79,7 +79,7 @@ def test_ppo_learns_from_the_rows() -> None:
         assert model.num_timesteps == 8 * 32
 
 
-def test_features_of_greens_have_sizes_and_spread_worlds_start_at_different_times() -> None:
+def test_sizes_count_features_of_greens_and_spread_worlds_start_at_different_times() -> None:
     with pytest.raises(ConfigError, match="features"):
         make(features="cars")
     with closing(make()) as rows, pytest.raises(ConfigError, match="sizes"):

@@ -1,4 +1,4 @@
-"""The balancer imports the standard library and NumPy; two listed files import more."""
+"""`cavmarl/balance` imports the standard library and NumPy; two listed files import more."""
 
 from __future__ import annotations
 
@@ -31,5 +31,5 @@ def test_pure_modules_import_only_allowed_modules(path: Path) -> None:
             assert path.stem == "probe" or top not in IMPURE, name
 
 
-def test_these_tests_find_the_files_of_the_core() -> None:
+def test_these_tests_find_the_files_of_the_package() -> None:
     assert len(FILES) > 10

@@ -25,7 +25,7 @@ from cavmarl.core.errors import ConfigError, MissingExtraError
 from cavmarl.maps.check import check_map
 
 
-def test_all_sides_and_sensors_are_measured() -> None:
+def test_all_programs_and_sensors_are_measured() -> None:
     pytest.importorskip("highway_env")
     told: list[str] = []
     found = measure_step_speed(agents=3, worlds=2, repeats=2, progress=told.append)
@@ -121,7 +121,7 @@ def test_the_road_of_the_benchmark_can_be_driven(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="no affinity on this system")
-def test_the_use_of_one_core_is_undone() -> None:
+def test_after_a_measurement_on_one_core_the_process_may_use_all_its_cores() -> None:
     before = os.sched_getaffinity(0)
     with step_speed.one_core():
         assert len(os.sched_getaffinity(0)) == 1

@@ -46,7 +46,9 @@ def test_three_movements_of_a_crossing_with_different_priorities_yield_in_a_circ
 
 
 @pytest.mark.parametrize("kind", ["priority", "right_before_left", "allway_stop", "traffic_light"])
-def test_priority_roads_equal_roads_and_signals_have_no_circle(tmp_path: Path, kind: str) -> None:
+def test_ordinary_junctions_have_no_movements_that_yield_in_a_circle(
+    tmp_path: Path, kind: str
+) -> None:
     network = read_network(crossroads(tmp_path, kind, N=1, S=1, W=4, E=4))
     assert not circular_priority(network).size
 

@@ -26,7 +26,7 @@ def test_an_empty_tick_and_the_loss_of_a_node_are_measured() -> None:
     assert [row["times"] for row in found.rows] == [1, 1, 1, 1]
 
 
-def test_a_city_its_half_and_two_halves_at_once_are_measured() -> None:
+def test_a_city_half_of_it_and_two_halves_at_once_are_measured() -> None:
     least = PER_JUNCTION * 32
     found = node_limit.measure(vehicles=least, steps=1, repeats=1)
     assert [row["world"] for row in found.rows] == [

@@ -82,7 +82,7 @@ def test_contacts_on_shared_ground_are_counted_separately(
 def test_the_bound_allows_few_vehicles_off_the_road_and_none_on_the_wrong_way() -> None:
     one = yardstick.Drive(trips=2000)
     one.counts["off_road"] = 1
-    assert one.holds, "0.05 % of the trips off the road are not allowed"
+    assert one.holds, "the bound does not allow that 0.05 % of the trips leave the road"
     one.counts["off_road"] = 2
     assert not one.holds
     one.counts["off_road"] = 0
@@ -90,7 +90,7 @@ def test_the_bound_allows_few_vehicles_off_the_road_and_none_on_the_wrong_way() 
     assert not one.holds
 
 
-def test_red_and_a_vehicle_ahead_are_causes_to_stand() -> None:
+def test_a_red_signal_and_a_vehicle_ahead_are_reasons_to_stand() -> None:
     world = load_world("grid4x4", agents=2, background=0)
     vec = CavVectorEnv(LocalWorlds(world, 1))
     vec.reset(seed=1)
@@ -109,7 +109,7 @@ def test_red_and_a_vehicle_ahead_are_causes_to_stand() -> None:
     assert watch.has_cause(rows, 0, green)
 
 
-def test_priority_and_a_full_road_are_causes_to_stand() -> None:
+def test_foes_with_priority_and_a_full_road_are_reasons_to_stand() -> None:
     vec = CavVectorEnv(LocalWorlds(load_world("town", agents=2, background=0), 1))
     vec.reset(seed=1)
     network, watch = vec.network, yardstick.StandingVehicles(vec)

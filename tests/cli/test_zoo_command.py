@@ -72,7 +72,7 @@ def test_the_list_shows_the_other_drivers_if_one_result_is_refused(
     assert "evaluate again" in " ".join(said.err.split())
 
 
-def test_cross_prints_the_results_of_each_driver_among_vehicles_of_each_other(
+def test_zoo_cross_prints_the_results_of_each_driver_among_vehicles_of_each_driver(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "cross.json"

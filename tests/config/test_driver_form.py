@@ -110,7 +110,7 @@ def test_the_error_for_different_forms_names_the_keys() -> None:
 
 @pytest.mark.parametrize("name", ["idm", "idm+random_actions", "shielded:never_yield"])
 def test_scripts_have_no_form(name: str) -> None:
-    with pytest.raises(PolicyError, match=r"is a script.*accepts the env.*cities_residual"):
+    with pytest.raises(PolicyError, match=r"is a script.*an environment can copy.*cities_residual"):
         form_of_driver(name)
 
 

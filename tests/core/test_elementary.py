@@ -111,7 +111,7 @@ def test_functions_return_the_same_bits_in_python_and_in_kernels(
 
 @given(st.lists(floats))
 @example([*EDGES])
-def test_functions_of_arrays_return_the_same_bits_as_of_numbers(values: list[float]) -> None:
+def test_functions_return_the_same_bits_for_arrays_as_for_numbers(values: list[float]) -> None:
     x = np.array(values, np.float64)
     for of_all, of_one in (
         (arrays.sin_all, sine),

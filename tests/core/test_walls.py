@@ -31,7 +31,7 @@ def test_random_lines_are_cut_exactly_if_they_cross_a_wall() -> None:
 def test_lines_along_borders_of_cells_are_cut_exactly_if_they_cross_a_wall(
     walls: list[tuple[int, int, int, int]], line: tuple[int, int, int, int]
 ) -> None:
-    # Coordinates are whole metres and cells have 2 m, so many lines run along borders of cells.
+    # Coordinates are whole metres and cells are 2 m wide, so many lines run along borders of cells.
     segments = np.array(walls, dtype=np.float64)
     ends = [float(number) for number in line]
     expected = any(crosses(wall, *ends) for wall in segments.tolist())

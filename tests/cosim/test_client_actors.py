@@ -287,7 +287,7 @@ def test_refused_requests_get_a_reason_and_change_nothing(address: Path) -> None
             assert len(env.external.vehicles()) == 3
 
 
-def test_a_world_without_places_for_actors_names_the_setting(address: Path) -> None:
+def test_the_refusal_of_a_world_without_places_for_actors_names_the_setting(address: Path) -> None:
     env = make_env(**{"population.external": 0})
     with FollowedWorld(env, address) as world:
         world.reset(seed=1)

@@ -87,7 +87,7 @@ def test_without_messages_the_world_has_no_spat_sensor() -> None:
 
 
 @pytest.mark.parametrize("stage", ["told", "spat"])
-def test_a_signal_with_unknown_state_is_red_in_stage_spat_and_ignored_in_stage_told(
+def test_the_stage_spat_treats_an_unknown_state_as_red_and_the_stage_told_ignores_it(
     stage: str,
 ) -> None:
     """Plan towards a signal with no known state.

@@ -40,7 +40,9 @@ def test_the_order_of_rows_does_not_matter(rows: NDArray[np.void], random: objec
 @pytest.mark.parametrize(
     ("heading", "reach_m"), [(0.0, 2.0), (0.3, 2.69), (-0.3, 2.69), (7.0, 3.396)]
 )
-def test_contact_side_by_side_depends_on_widths_and_angle(heading: float, reach_m: float) -> None:
+def test_widths_and_angle_decide_whether_adjacent_vehicles_touch(
+    heading: float, reach_m: float
+) -> None:
     for apart_m, touch in ((reach_m - 0.02, [1, 0]), (reach_m + 0.02, [-1, -1])):
         for sign in (1.0, -1.0):
             rows = vehicles([(0.0, 0.0, 0.0), (0.0, sign * apart_m, heading)])
@@ -67,6 +69,6 @@ def test_contacts_of_trucks_longer_than_a_cell_are_found() -> None:
     assert contacts(rows, 2.0) == [-1, -1]
 
 
-def test_a_car_finds_the_truck_that_it_touches_far_from_its_centre() -> None:
+def test_a_car_finds_a_truck_that_it_touches_far_from_the_trucks_centre() -> None:
     rows = vehicles([(-9.0, 0.0, 0.0), (2.4, 0.0, 0.0)], length=[18.0, 5.0])
     assert contacts(rows, 2.0) == [1, 0]

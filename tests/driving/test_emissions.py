@@ -42,7 +42,7 @@ def sumo_run(program: str, *arguments: str | Path) -> None:
 
 
 def driving_cycle(folder: Path, emission_class: str, rows: NDArray[np.void]) -> NDArray[np.float64]:
-    """Return the table (n, 11) of SUMO's tool for these rows, in mg/s, and Wh for electricity."""
+    """Return SUMO's table (n, 11) for these rows: emissions in mg/s, electricity in Wh."""
     cycle, found = folder / "cycle.csv", folder / "found.csv"
     slopes = np.degrees(rows["pitch"])
     columns = zip(rows["speed"].tolist(), rows["accel"].tolist(), slopes.tolist(), strict=True)

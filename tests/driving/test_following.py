@@ -125,7 +125,7 @@ def test_speed_behind_returns_the_speed_whose_desired_gap_is_the_given_gap(
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_accel_behind_equals_the_function_wish_for_the_constraint_of_the_leader(name: str) -> None:
+def test_accel_behind_equals_wish_with_the_constraint_of_the_leader(name: str) -> None:
     kind = KINDS[name]
     constraint = behind(kind, 12.0, 20.0, 9.0, 4.0)
     assert accel_behind(kind, 12.0, 15.0, 20.0, 9.0, 4.0) == wish(kind, 12.0, 15.0, constraint)

@@ -27,7 +27,7 @@ def scene(crossing: Callable[[str], Path]) -> Make:
 
 
 @pytest.mark.parametrize(("speed", "left_m", "straight_m"), [(0.0, 1.0, 3.0), (8.0, 10.0, 20.0)])
-def test_oncoming_cars_do_not_brake_for_a_left_turn_on_its_way_to_its_waiting_position(
+def test_oncoming_cars_do_not_brake_for_a_left_turning_car_before_its_waiting_position(
     scene: Make, speed: float, left_m: float, straight_m: float
 ) -> None:
     here = scene("traffic_light")

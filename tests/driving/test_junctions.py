@@ -76,7 +76,7 @@ def test_the_side_road_waits_until_a_column_has_passed(scene: Make) -> None:
 def test_a_crossing_car_yields_even_after_a_long_wait(scene: Make, waited_s: float) -> None:
     here = scene("priority")
     here.put("side", "S_in_0", 1.0, "N_out", wait_s=waited_s)
-    here.put("main", "W_in_0", 60.0, "E_out", speed=11.0)  # reaches its line in 5.5 s
+    here.put("main", "W_in_0", 60.0, "E_out", speed=11.0)  # the car reaches its line in 5.5 s
     times = here.entries(25.0)
     assert set(times) == {"side", "main"}
     assert times["main"] < times["side"]

@@ -127,8 +127,8 @@ def test_a_full_road_is_blocked_if_its_vehicles_wait_at_the_next_line(tmp_path: 
 
 
 def test_a_free_waiting_position_in_the_next_junction_counts_as_room(tmp_path: Path) -> None:
-    # Two cars of 5 m, each with 3 m behind it, need 16 m. The road has 14 m, and the next waiting
-    # position is 2.4 m inside the junction.
+    # Two cars of 5 m, each with 3 m behind it, need 16 m. The road is 14 m long, and the next
+    # waiting position is 2.4 m inside the junction.
     for light, taken, blocked in (
         (SIGNAL_GREEN_MINOR, False, False),
         (SIGNAL_GREEN_MINOR, True, True),
@@ -149,7 +149,7 @@ def test_a_driver_follows_moving_vehicles_to_a_line_without_a_signal(tmp_path: P
 
 
 def test_u_turns_at_both_ends_of_a_short_road_do_not_block_each_other(tmp_path: Path) -> None:
-    """Each direction of the road has room for one vehicle; the U-turns lead to the other one."""
+    """Each direction of the road has room for one vehicle; U-turns lead to the other direction."""
     net, routes = turning_pair(tmp_path)
     world = make_world(net, [routes], 1000, 1, 0.1)
     commands = idle_commands(world)

@@ -181,7 +181,7 @@ def test_a_vehicle_that_stands_over_30_m_behind_on_an_incoming_lane_is_not_a_fol
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_places_on_neighbour_lanes_equal_twin_and_are_close(name: str) -> None:
+def test_beside_s_equals_twin_and_finds_almost_the_nearest_position(name: str) -> None:
     roads = network(name)
     asked = 0
     for lane in np.flatnonzero(~roads.lanes["internal"]).tolist():

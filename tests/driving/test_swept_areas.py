@@ -117,7 +117,7 @@ class BusAndCar:
         )  # fmt: skip
 
     def _announced(self, asks: int, places: tuple[float, float]) -> Scratch:
-        """Register the vehicle that is not `asks`; `places`: fronts in m beyond their lines."""
+        """Register the vehicle other than `asks`; `places`: fronts in m beyond the lines."""
         room = scratch(self.network, 2)
         other = 1 - asks
         links = (self.link, int(self.sweep["foe"]))
@@ -382,7 +382,7 @@ def test_a_car_must_not_enter_the_road_where_a_bus_sweeps(
         "a bus that has passed counts"
     )
     assert not meeting.car_is_swept((enter_m + 1.0, far)), (
-        "a car that enters before the area is swept"
+        "a car that can stop before the area counts as swept"
     )
     assert not meeting.car_is_swept((enter_m - 5.0, at_line)), "a standing bus counts"
     meeting.rows["speed"][0] = 6.0

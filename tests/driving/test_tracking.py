@@ -61,7 +61,7 @@ def test_a_vehicle_on_a_lane_is_located_there(name: str, data: st.DataObject) ->
     assert events == 0
 
 
-def test_a_vehicle_over_half_a_lane_aside_is_on_the_neighbour_lane() -> None:
+def test_a_vehicle_that_is_moved_by_over_half_a_lane_is_on_the_neighbour_lane() -> None:
     roads = network("merge")
     right, left = lane_of(roads, "main_in_0"), lane_of(roads, "main_in_1")
     half = 0.5 * float(roads.lanes[right]["width_m"])
@@ -127,7 +127,7 @@ def test_a_vehicle_off_the_road_has_an_event() -> None:
     assert find("merge", row)[3] & EVENT_OFF_ROAD
 
 
-def test_a_vehicle_against_the_lane_has_the_event_wrong_way() -> None:
+def test_a_vehicle_that_faces_against_its_lane_has_the_event_wrong_way() -> None:
     roads = network("grid4x4")
     lane = lane_of(roads, "A1B1_0")
     row = on_lane(roads, lane, 40.0)

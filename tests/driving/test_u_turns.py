@@ -253,7 +253,7 @@ def test_a_vehicle_on_a_lane_without_a_link_is_listed_at_the_link_of_the_adjacen
 def test_a_bus_before_a_u_turn_waits_for_vehicles_that_have_entered_beside_its_target_lane(
     network: RoadNetwork, size: int
 ) -> None:
-    """Vehicles beside the target lane are registered at the U-turn itself, as its own foe."""
+    """Vehicles beside the target lane are registered at the U-turn, which is its own foe."""
     turn, lane = u_turn_without_other_links(network)
     length_m = float(network.links["length_m"][turn])
     sweeps = sweeps_of(network, turn)

@@ -24,7 +24,7 @@ def for_general_path(actions: NDArray[Any]) -> NDArray[Any]:
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_both_paths_decode_continuous_actions_equally(dtype: type) -> None:
+def test_the_fast_and_the_general_path_decode_continuous_actions_equally(dtype: type) -> None:
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 3, 2)).astype(dtype)
     actions[~MASK] = np.nan  # must not be read: these agents have no vehicle
     config = ActionConfig(kind="continuous")
@@ -35,7 +35,7 @@ def test_both_paths_decode_continuous_actions_equally(dtype: type) -> None:
     assert found.controls[~MASK].tolist() == [[0.0, 0.0]] * 2
 
 
-def test_both_paths_decode_discrete_actions_equally() -> None:
+def test_the_fast_and_the_general_path_decode_discrete_actions_equally() -> None:
     actions = np.random.default_rng(0).integers(0, 5, (2, 3))
     actions[~MASK] = 99
     config = ActionConfig(kind="discrete")

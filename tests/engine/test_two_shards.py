@@ -23,7 +23,7 @@ from tests.support.world import traffic_of
 
 STEPS = 120
 TICKS = 1000
-Returns = dict[tuple[int, int], float]  # (world, vehicle id): return
+Returns = dict[tuple[int, int], float]  # (world, vehicle id) → return
 
 SENSORS: dict[str, Any] = {
     "sensors.lidar.rays": 32,

@@ -61,7 +61,7 @@ def test_agents_have_the_types_of_their_parts() -> None:
         kind = types[row["vtype"]]
         if PARTS[row["agent"]]:
             assert (kind["length"], kind["width"], kind["max_speed"]) == (6.4, 2.1, 36.0)
-            assert kind["accel"] == kind["most_accel"] == 1.5  # the value of a truck
+            assert kind["accel"] == kind["most_accel"] == 1.5  # the acceleration of a truck in m/s²
             assert kind["wheelbase"] == 4.8
         else:
             assert kind["length"] == 5.0

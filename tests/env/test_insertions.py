@@ -43,7 +43,7 @@ def test_a_divided_world_with_insertions_equals_the_undivided_one() -> None:
 
 
 @pytest.mark.slow
-def test_worlds_over_nodes_are_equal() -> None:
+def test_worlds_over_nodes_equal_the_undivided_one() -> None:
     assert hashes(zones=2, nodes=2) == hashes()
 
 

@@ -222,7 +222,7 @@ def test_saved_states_with_invalid_reversals_are_refused(tmp_path: Path) -> None
             1.0,
             1.0,
         )
-        assert "is not reversed are open" in changes.wrong((opened, states))
+        assert "are open on a road that is not reversed" in changes.wrong((opened, states))
 
 
 def test_invalid_reversals_are_refused_with_a_remedy() -> None:

@@ -10,7 +10,7 @@ from cavmarl.config.terms import TERMS
 SHARE, RANGE_M = 0.3, 40.0
 
 
-def test_a_share_of_the_reward_is_the_mean_of_nearby_agents() -> None:
+def test_a_share_of_the_reward_is_the_mean_reward_of_nearby_agents() -> None:
     near = {"terms.team_share": SHARE, "terms.team_range_m": RANGE_M}
     vec = make_vec("merge", num_envs=2, overrides={"terms.weights": {"delay": 1.0}, **near})
     vec.reset(seed=0)

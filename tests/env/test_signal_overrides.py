@@ -72,7 +72,7 @@ def test_a_successor_of_a_dead_worker_continues() -> None:
 
 
 @pytest.mark.slow
-def test_worlds_over_nodes_are_equal() -> None:
+def test_worlds_over_nodes_equal_the_undivided_one() -> None:
     assert hashes(zones=2, nodes=2) == hashes()
 
 

@@ -86,7 +86,7 @@ def passages(draw: st.DrawFn) -> list[Passage]:
 
 @settings(max_examples=60, deadline=None)
 @given(passages())
-def test_encroachment_equals_its_closed_form(drawn: list[Passage]) -> None:
+def test_post_encroachment_times_equal_their_closed_form(drawn: list[Passage]) -> None:
     expected = least_encroachments(ROADS, drawn)
     np.testing.assert_allclose(watch(drawn), expected, atol=1e-6)
 
@@ -108,7 +108,7 @@ def crossing() -> tuple[int, np.void]:
     raise AssertionError("no links that cross")
 
 
-def test_the_time_is_measured_to_the_last_vehicle_that_has_passed() -> None:
+def test_post_encroachment_time_begins_when_the_last_earlier_vehicle_has_passed() -> None:
     one, conflict = crossing()
     other = int(conflict["foe"])
     platoon = [Passage(one, start, 10.0, 5.0) for start in (-5.0, -20.0)]

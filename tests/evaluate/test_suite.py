@@ -83,7 +83,7 @@ def test_an_invalid_suite_is_refused(tmp_path: Path, text: str, message: str) ->
         load_suite(file)
 
 
-def test_the_suite_of_tasks_does_not_change_its_environments() -> None:
+def test_the_suite_of_tasks_overrides_no_settings_of_its_environments() -> None:
     suite = load_suite(find_settings("suite", "tasks"))
     worlds = worlds_of(suite, ROOT / "envs")
     assert [world.env for world in worlds] == list(suite.maps)

@@ -111,7 +111,7 @@ def test_the_error_without_sumo_names_the_extra(monkeypatch: pytest.MonkeyPatch)
         run_sumo(job(demand))
 
 
-def test_a_configuration_gives_files_begin_and_options() -> None:
+def test_a_configuration_gives_the_files_the_begin_and_the_options() -> None:
     found = read_input([GAME / "fokr_bs_demo.sumocfg"])
     assert found.net_file == GAME / "fokr_bs_demo" / "fokr_bs.net.xml.gz"
     assert [path.name for path in found.additional_files] == [

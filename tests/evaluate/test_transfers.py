@@ -70,7 +70,7 @@ def test_the_manifest_has_the_zones(folder: Path) -> None:
     assert world["config"]["zones"]["hysteresis_m"] == 2.0
 
 
-def test_zones_change_no_other_metric(folder: Path) -> None:
+def test_zones_change_no_metric_but_the_imbalance_of_zones(folder: Path) -> None:
     whole = evaluate("grid4x4", "idm", seed=2, repeats=2, **SMALL)
     assert whole["idm"].transfers is None
     assert whole["idm"]["zone_imbalance"].mean is None

@@ -31,7 +31,7 @@ def test_the_digest_equals_its_plain_twin(
     assert (int(upper) << 64) + int(lower) == expected
 
 
-def test_the_sum_of_digests_carries_from_word_to_word() -> None:
+def test_the_sum_of_digests_carries_from_the_lower_to_the_upper_word() -> None:
     word = next(w for w in range(1000) if naive.mixed(w) > 1 << 63)
     words = np.full((4, 1), word, dtype=np.uint64)
     all_bits, one = np.array([(1 << 64) - 1], np.uint64), np.array([1], np.uint64)

@@ -115,7 +115,7 @@ def test_corrections_and_warnings_are_counted_by_kind(
 
 
 def test_a_box_crops_the_map(shared_maps: Path, tmp_path: Path) -> None:
-    whole = shared_maps / "osm" / "laufamholz.osm.xml"  # the whole map has 1,425 m by 692 m
+    whole = shared_maps / "osm" / "laufamholz.osm.xml"  # a map of 1,425 m by 692 m
     box = (11.153, 49.464, 11.159, 49.468)
     result = build_network(whole, tmp_path / "part.net.xml", bbox=box)
     min_x, min_y, max_x, max_y = read_network(result.path).extent_m

@@ -54,7 +54,7 @@ def test_close_junctions_share_the_ground_of_their_internal_lanes(
 def test_a_road_over_a_junction_shares_ground_with_the_junction(
     tmp_path: Path, apart_m: float, meet: bool
 ) -> None:
-    """The road passes a bend, at its outer side."""
+    """The road passes a bend on the outer side of the bend."""
     nodes = {"b": (20.0 + apart_m, -20.0 + apart_m), "e": (-20.0 + apart_m, 20.0 + apart_m)}
     network = bend_beside(tmp_path, nodes, ("be",))
     inside = network.lanes["internal"]

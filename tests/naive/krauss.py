@@ -6,7 +6,7 @@ from __future__ import annotations
 def safe_speed(
     gap: float, front_speed: float, decel: float, front_decel: float, reaction_s: float
 ) -> float:
-    """Return the largest speed with a stopping distance up to the gap plus the leader's."""
+    """Return the largest speed at which a driver can stop behind a leader that brakes."""
     room = gap + front_speed**2 / (2.0 * max(decel, front_decel))
     low, high = 0.0, 1000.0
     for _ in range(100):

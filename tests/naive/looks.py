@@ -102,7 +102,7 @@ class Looks:
             self._see(lane, 0.0, EXIT_LOOK_M - way)
 
     def _own(self, rect: tuple[float, float, float, float]) -> dict[int, tuple[float, float]]:
-        """Return the part of each lane in the zone with a margin, equal for lanes of an edge."""
+        """Return the part of each lane in the zone with a margin; lanes of an edge are alike."""
         parts: dict[int, list[float]] = defaultdict(list)
         for lane in range(len(self.lengths)):
             row = self.network.lanes[lane]

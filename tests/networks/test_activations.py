@@ -45,7 +45,7 @@ def test_tanh_is_close_to_the_exact_function_for_every_float32() -> None:
         check_tanh(np.arange(first, min(first + step, INFINITY), dtype=np.uint32))
 
 
-def test_functions_of_infinite_numbers_and_nan() -> None:
+def test_functions_have_limits_for_infinite_numbers_and_keep_nan() -> None:
     special = np.array([np.inf, -np.inf, np.nan, -0.0], dtype=np.float32)
     found = special.copy()
     apply_tanh(found)

@@ -34,7 +34,7 @@ OTHER_RUN = bytes(reversed(range(16)))
 
 
 def explore(**small: object) -> None:
-    """Check the invariants in each state of a small world, and that each can reach the end."""
+    """Check that in each state of a small world, the invariants hold and the end can be reached."""
     states, reached = Explorer(Small(**small)).run()  # type: ignore[arg-type]
     assert states == reached
 
@@ -177,7 +177,7 @@ def replica_lifetime() -> None:
     bench = approached(Bench(limits=Limits(lifetime=3)))
     bench.endpoints[
         0
-    ].offers.open.clear()  # as after the death of the source, no one refreshes the replica
+    ].offers.open.clear()  # no host refreshes the replica, as if its source were dead
     for _ in range(5):
         bench.tick()
     assert not bench.endpoints[1].replicas.held

@@ -1,4 +1,4 @@
-"""Visit all states of small worlds: the invariants hold in each, and each can reach the end.
+"""Visit all states of small worlds: in each state, the invariants hold and the end can be reached.
 
 The worlds have one vehicle in three zones, or two vehicles in two zones. Messages may be late,
 doubled or lost. Hosts of source, target and other zones, and the coordinator, may die at any time.

@@ -1,6 +1,6 @@
 """`cavmarl/ownership` uses only the standard library.
 
-It uses no input, output, clocks, threads or randomness.
+It is pure: it uses no input, output, clocks, threads or randomness.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def imports(path: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
-def test_a_file_of_the_core_is_pure(path: Path) -> None:
+def test_a_file_of_the_package_is_pure(path: Path) -> None:
     for module in imports(path):
         top = module.split(".")[0]
         ours = module == "cavmarl.core.errors" or module.startswith("cavmarl.ownership.")
@@ -39,7 +39,7 @@ def test_a_file_of_the_core_is_pure(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
-def test_a_file_of_the_core_does_not_call_print_open_or_hash(path: Path) -> None:
+def test_a_file_of_the_package_does_not_call_print_open_or_hash(path: Path) -> None:
     called = {
         node.func.id
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
@@ -55,5 +55,5 @@ def test_the_trace_checker_does_not_import_the_code_that_it_checks(name: str) ->
     assert not {f"cavmarl.ownership.{module}" for module in judged} & imports(path)
 
 
-def test_these_tests_find_the_files_of_the_core() -> None:
+def test_these_tests_find_the_files_of_the_package() -> None:
     assert len(FILES) > 15

@@ -38,7 +38,7 @@ RESTLESS = {"workers.balance_steps": 2, "workers.imbalance_tolerance": 0.0, "wor
 
 @pytest.fixture
 def moves_per_round(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Replace measured costs by random costs; return the list of the number of moves per round."""
+    """Replace measured costs by random costs; return the number of moves of each round."""
     rng = np.random.default_rng(3)
     moved: list[int] = []
     round_ = StepPlacement.round

@@ -224,7 +224,8 @@ def test_the_sender_of_a_bad_frame_is_lost_but_not_the_receiver() -> None:
     links.close()
 
 
-def test_of_two_nodes_that_cannot_reach_each_other_one_is_lost_in_each_generation_in_turn() -> None:
+def test_two_nodes_that_cannot_reach_each_other_are_lost_in_turn() -> None:
+    """Either may be at fault, so the lost node alternates with the number of changes of nodes."""
     links, far = pair()
     with far:
         found = []

@@ -133,7 +133,9 @@ def test_a_forked_process_cannot_step_or_end_the_nodes(make: Make) -> None:
     assert over_nodes(vec).pool.recoveries == 0
 
 
-def test_actuated_signals_and_demand_give_the_same_results(make: Make, tmp_path: Path) -> None:
+def test_actuated_signals_and_demand_give_the_results_of_one_process(
+    make: Make, tmp_path: Path
+) -> None:
     wanted = {"env": str(actuated_grid(tmp_path)), "agents": 4, "background": 40}
     whole = drive(make(**wanted), steps=60)
     vec = make(zones=4, nodes=2, **wanted)
@@ -316,7 +318,7 @@ def test_a_journal_records_changes_of_owner(make: Make, tmp_path: Path) -> None:
     assert sum(len(getattr(record, "switches", ())) for record in records) == switched > 0
 
 
-def test_the_pettingzoo_environment_gives_the_same_results() -> None:
+def test_the_pettingzoo_environment_gives_the_results_of_one_process() -> None:
     env = parallel_env("grid4x4", zones=4, nodes=2, agents=3, background=10)
     one = parallel_env("grid4x4", agents=3, background=10)
     for made in (env, one):

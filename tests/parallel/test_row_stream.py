@@ -154,7 +154,7 @@ def test_words_that_the_receiver_can_forecast_are_not_sent() -> None:
 
 
 def damage(words: NDArray[np.int64], harm: str) -> NDArray[np.int64]:
-    """Return a frame without leaving vehicles, damaged as `harm` says."""
+    """Return a frame in which no vehicle leaves, damaged as `harm` says."""
     ghosts = int(words[GHOSTS:LIKE:2].sum())
     if harm == "cut short":
         return words[:-1]

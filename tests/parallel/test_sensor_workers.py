@@ -266,7 +266,9 @@ def test_a_frame_of_another_tick_is_refused() -> None:
         turn = Turn(0, sensor, due, vec.worlds.arrays.frames[sensor.name])
         turn.due.num[:] = 1
         sensor_workers.shared.delivered[0, 0, 0] += 1
-        with pytest.raises(WorkerError, match=r"rig\.wheels: the frame of tick 0 .* one of tick 1"):
+        with pytest.raises(
+            WorkerError, match=r"rig\.wheels: the frame of tick 0 is missing.*is of tick 1"
+        ):
             sensor_workers.check([turn])
     finally:
         vec.close()

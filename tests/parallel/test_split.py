@@ -56,7 +56,7 @@ def test_a_long_run_over_workers_equals_the_undivided_one(make: Make) -> None:
     assert same(drive(make("grid4x4", zones=4, workers=2, **wanted), steps=80), whole)
 
 
-def test_worlds_with_next_step_autoreset_are_equal(make: Make) -> None:
+def test_worlds_with_next_step_autoreset_equal_the_undivided_one(make: Make) -> None:
     wanted = {"agents": 4, "background": 10, "max_cycles": 5, "autoreset_mode": "NextStep"}
     whole = drive(make("town", **wanted))
     assert same(drive(make("town", zones=4, workers=2, **wanted)), whole)
@@ -73,7 +73,7 @@ def test_worlds_over_three_workers_equal_undivided_worlds(make: Make) -> None:
     )
 
 
-def test_a_world_with_invariant_checks_is_equal(make: Make) -> None:
+def test_a_world_with_invariant_checks_equals_the_undivided_one(make: Make) -> None:
     wanted = {"agents": 5, "background": 30}
     whole = drive(make("grid4x4", **wanted))
     checked = make(
@@ -171,14 +171,16 @@ def test_an_exception_in_one_worker_undoes_the_step_of_all_workers(
     assert alive(left) == []
 
 
-def test_actuated_signals_are_equal(make: Make, tmp_path: Path) -> None:
+def test_actuated_signals_equal_those_of_the_undivided_world(make: Make, tmp_path: Path) -> None:
     wanted = {"agents": 4, "background": 30, "max_cycles": 25}
     net = actuated_grid(tmp_path)
     whole = drive(make(net, **wanted), steps=40)
     assert same(drive(make(net, zones=4, workers=2, **wanted), steps=40), whole)
 
 
-def test_rerouting_vehicles_take_equal_routes(make: Make, tmp_path: Path) -> None:
+def test_rerouting_vehicles_take_the_routes_of_the_undivided_world(
+    make: Make, tmp_path: Path
+) -> None:
     net = make_map(tmp_path)
     files = write_demand(tmp_path, CARS.format(device=DEVICE) + FLOW)
     wanted = {
@@ -205,7 +207,7 @@ def test_rerouting_vehicles_take_equal_routes(make: Make, tmp_path: Path) -> Non
     assert one.traffic_stats()["rerouted"] > 0, "no vehicle has taken another route"
 
 
-def test_worlds_with_more_workers_than_zones_are_equal() -> None:
+def test_more_workers_than_zones_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"workers = 3.*at most 2.*more zones"):
         make_vec("grid4x4", zones=2, workers=3)
     with pytest.raises(ConfigError, match=r"workers = 9.*at most 8.*more worlds"):

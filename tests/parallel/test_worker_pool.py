@@ -146,7 +146,7 @@ def test_a_team_is_replaced_as_a_whole(make: Make, dying: int, tmp_path: Path) -
     assert alive(before[:2]) == []
 
 
-def test_a_replaced_team_repeats_a_command_only_in_the_workers_that_had_it(make: Make) -> None:
+def test_a_replaced_team_repeats_a_command_only_in_the_workers_that_received_it(make: Make) -> None:
     pool = make(workers=2, teams=((0, 1),))
     pool.run(ADD)
     os.kill(pool.pids[1], signal.SIGKILL)

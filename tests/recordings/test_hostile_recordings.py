@@ -184,7 +184,7 @@ def test_the_error_for_a_forged_recording_has_one_line(
     with limited_memory(1 << 30), pytest.raises(RecordingError, match=words) as caught:
         Use(pictures=True, page=True).read(bad, tmp_path)
     assert "\n" not in str(caught.value)
-    assert ";" in str(caught.value)  # between fault and remedy
+    assert ";" in str(caught.value)  # separates the fault and the remedy
 
 
 def test_the_replay_command_reports_the_error_of_a_forged_recording(bad: Path) -> None:

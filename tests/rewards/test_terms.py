@@ -124,7 +124,7 @@ def test_event_terms_are_1_in_the_step_of_the_event(bit: int, name: str) -> None
     assert all(found[flag] in (0.0, 1.0) for flag in flags)
 
 
-def test_time_to_collision_of_a_faster_follower() -> None:
+def test_the_collision_risk_of_a_faster_follower_follows_from_gap_and_speeds() -> None:
     # The follower is 10 m/s faster and the gap is 20 m, so the time to collision is 2 s.
     rows = vehicles([(0.0, 0.0, 0.0), (25.0, 0.0, 0.0)], speed=[15.0, 5.0])
     assert terms(rows)["ttc_risk"] == pytest.approx(1.0 - 2.0 / TTC_HORIZON_S)

@@ -63,7 +63,7 @@ def test_a_turn_waits_inside_the_junction_before_the_shared_area(
 
 
 @pytest.mark.parametrize("yields", [(False, True), (True, True), (False, False)])
-def test_a_waiting_position_moves_only_before_links_with_priority(
+def test_a_waiting_position_moves_only_if_the_other_link_has_priority(
     yields: tuple[bool, bool],
 ) -> None:
     assert waiting_place(10.0, 8.0, yields) == 10.0

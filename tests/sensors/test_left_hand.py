@@ -84,7 +84,7 @@ def both_worlds(
 
 
 @pytest.mark.parametrize("junctions", ["traffic_light", "allway_stop"])
-def test_exchanging_sides_turns_observations_into_those_of_the_mirrored_world(
+def test_observations_with_exchanged_sides_equal_those_of_the_mirrored_world(
     tmp_path: Path, junctions: str
 ) -> None:
     overrides = EVERY

@@ -331,7 +331,7 @@ def test_a_horizon_between_two_predictions_is_refused() -> None:
         ConflictsConfig(count=1, horizon_s=4.7)
 
 
-def test_settings_without_sight_omit_sensors_of_vehicles_and_lines() -> None:
+def test_without_sight_switches_off_the_sensor_conflicts_and_the_lines_of_way() -> None:
     config = SensorsConfig(
         way=WayConfig(distances_m=(5.0,), lines=2),
         conflicts=ConflictsConfig(count=3),
@@ -342,7 +342,7 @@ def test_settings_without_sight_omit_sensors_of_vehicles_and_lines() -> None:
     assert config.without_sight().way.lines == 0
 
 
-def test_the_time_of_change_is_off_by_default() -> None:
+def test_the_time_to_a_signal_change_is_not_observed_by_default() -> None:
     config = SensorsConfig(way=WayConfig(lines=1))
     assert not config.way.timing
     assert not config.signal.timing

@@ -99,7 +99,7 @@ def test_a_world_after_a_reset_has_only_the_samples_that_are_due_at_its_start() 
     assert (frames["slow"].data[0] == 0.0).all()
 
 
-def test_worlds_that_are_loaded_into_other_worlds_keep_their_samples() -> None:
+def test_a_state_that_is_loaded_into_other_worlds_keeps_its_samples() -> None:
     world = load_world("grid4x4", overrides=WORLD)
     here, there = LocalWorlds(world, 2), LocalWorlds(world, 2)
     here.arrays.chosen[:] = True

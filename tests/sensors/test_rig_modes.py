@@ -91,7 +91,7 @@ def _same(space: Any, seen: Any) -> bool:
     return bool(seen.shape == space.shape and seen.dtype == space.dtype)
 
 
-def test_observation_mode_sensors_without_a_sensor_is_refused() -> None:
+def test_the_observation_mode_sensors_is_refused_without_a_sensor() -> None:
     with pytest.raises(
         ConfigError, match=r"observation\.mode = 'sensors': needs a sensor under rig"
     ):

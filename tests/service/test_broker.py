@@ -367,7 +367,7 @@ def test_a_timeout_is_recorded(fleet: Fleet) -> None:
     fleet.now_s += 2.0
     fleet.broker.sweep()
     assert job.state == "failed"
-    assert job.message.startswith("no node took it within 30 s: no node can take this (no node is")
+    assert job.message.startswith("no node took the job within 30 s: no node can take this (")
     fleet.join("a")
     assert fleet.beat("a")["jobs"] == []
     session = fleet.open()
@@ -436,7 +436,7 @@ def test_jobs_that_no_node_can_take_delay_no_other_job(fleet: Fleet) -> None:
     assert asked <= 1100  # at most 100 searches per second
 
 
-def test_a_pass_continues_after_the_last_job_of_the_previous_pass(fleet: Fleet) -> None:
+def test_a_pass_over_waiting_jobs_continues_where_the_previous_pass_stopped(fleet: Fleet) -> None:
     job = {"policies": ["idm"], "episodes": 1, "repeats": 1}
     early = fleet.open(job=job, needs=["x"])
     for k in range(60):
@@ -462,7 +462,7 @@ def test_a_job_fails_after_ten_nodes_were_lost_with_it(fleet: Fleet) -> None:
         fleet.join(f"n{k}")
         fleet.broker.leave(fleet.nodes, f"n{k}")
     fleet.broker.sweep()
-    assert (job.state, job.message) == ("failed", "10 nodes were lost with it")
+    assert (job.state, job.message) == ("failed", "10 nodes were lost while they ran the job")
 
 
 def test_a_training_that_stores_states_may_lose_more_than_ten_nodes(fleet: Fleet) -> None:
@@ -478,7 +478,7 @@ def test_a_training_that_stores_states_may_lose_more_than_ten_nodes(fleet: Fleet
         fleet.join(f"n{k}")
         fleet.broker.leave(fleet.nodes, f"n{k}")
     fleet.broker.sweep()
-    assert (job.state, job.message) == ("failed", "10 nodes were lost with it")
+    assert (job.state, job.message) == ("failed", "10 nodes were lost while they ran the job")
 
 
 def test_nodes_that_have_left_are_deleted_after_a_day(fleet: Fleet) -> None:

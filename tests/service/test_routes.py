@@ -127,7 +127,7 @@ def test_a_role_may_use_a_route_if_and_only_if_the_matrix_says_so(
     refused = set()
     for role in ROLES:
         if name in ("DELETE /v1/token", "GET /v1/events/stream") and role in (allowed or ()):
-            continue  # the first one would end sessions of other tests; the second never ends
+            continue  # DELETE would end sessions of other tests; the stream never ends
         answer = ask(service, tokens[role], method, path)
         assert answer.status_code != 401
         refused |= {role} if answer.status_code == 403 else set()

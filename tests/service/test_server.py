@@ -67,7 +67,7 @@ def test_the_service_starts_without_kernels(tmp_path: Path) -> None:
     assert {name for name in mapped if any(word in name for word in heavy)} == set()
 
 
-def test_the_benchmark_measures_and_its_replay_is_equal() -> None:
+def test_the_benchmark_of_the_service_measures_and_its_replay_gives_the_same_state() -> None:
     found = service_benchmark.measure(nodes=200, requests=60, seconds=2, hours=0.1)
     assert found.holds
     assert found.facts["churn"]["sessions hosted that are not active"] == 0

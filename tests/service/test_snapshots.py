@@ -389,7 +389,7 @@ def test_a_standby_reads_the_snapshot_first(empty_postgresql: str) -> None:
 
 def test_the_schema_follows_from_the_fields_of_the_records() -> None:
     assert SNAPSHOT_SCHEMA.startswith("cavmarl.snapshot/1 ")
-    assert len(SNAPSHOT_SCHEMA) <= 128  # the width of its column
+    assert len(SNAPSHOT_SCHEMA) <= 128  # width of the database column
     assert json.loads(text_of(Infrastructure())).keys() == {
         one.name for one in fields(Infrastructure) if one.name != "unused"
     }

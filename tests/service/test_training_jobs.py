@@ -119,7 +119,7 @@ def test_a_training_with_own_files_is_submitted_and_fetched_by_commands(
     assert world["horizon_s"] == 20.0
 
 
-def test_a_training_that_fails_tells_the_message_of_the_program(
+def test_a_failed_training_reports_the_message_of_the_program(
     cluster: Cluster, client: Client, tmp_path: Path
 ) -> None:
     start(cluster, "first")
@@ -137,9 +137,9 @@ def test_a_training_that_fails_tells_the_message_of_the_program(
     [
         ({"env": "merge"}, "env belongs to the configuration; remove it"),
         ({"num_envs": 4}, "num_envs belongs to the configuration"),
-        ({"plugins": "antigravity"}, "plugins is the node's to choose"),
-        ({"runs": "there"}, "runs is the node's to choose"),
-        ({"resume": "there"}, "resume is the node's to choose"),
+        ({"plugins": "antigravity"}, "plugins is chosen by the node"),
+        ({"runs": "there"}, "runs is chosen by the node"),
+        ({"resume": "there"}, "resume is chosen by the node"),
         ({"gama": 0.9}, "gama is unknown; known settings: anneal, average, "),
         ({"program": "ppo.py"}, "program is unknown"),
         ({"config": "merge"}, "config is unknown"),

@@ -482,7 +482,7 @@ def test_a_divided_world_equals_the_undivided_one(
 
 
 @pytest.mark.integration
-def test_results_are_the_same_on_workers_when_one_is_killed(
+def test_results_on_workers_equal_the_undivided_ones_when_a_worker_is_killed(
     sensing: str, undivided: list[str], undivided_world: list[str]
 ) -> None:
     # Workers share the zones of a single world, or each worker runs whole worlds.
@@ -491,7 +491,9 @@ def test_results_are_the_same_on_workers_when_one_is_killed(
 
 
 @pytest.mark.integration
-def test_results_are_the_same_over_nodes(sensing: str, undivided_world: list[str]) -> None:
+def test_results_over_nodes_equal_the_undivided_ones(
+    sensing: str, undivided_world: list[str]
+) -> None:
     assert hashes(sensing, num_envs=1, zones=3, nodes=2, kill_at=(24,)) == undivided_world
 
 

@@ -128,7 +128,7 @@ def test_webster_follows_the_program_before_a_flow_is_known(view: SignalView) ->
     assert choice("webster", with_green_s(view, due_s), decide_s=1.0) == 1
 
 
-def test_actuated_ends_a_green_at_a_gap(view: SignalView) -> None:
+def test_the_controller_actuated_ends_a_green_at_a_gap(view: SignalView) -> None:
     at = view.table.prolonging.first
     (lane, *_) = view.table.prolonging.lanes[at[0] : at[1]]
     assert lane in lanes_of(view, 0)
@@ -214,7 +214,7 @@ def test_detectors_count_vehicles_and_store_the_last_time() -> None:
                 assert counted.sum() > 20
                 counted[:] = 0
             assert (history[:, PASSED] == counted).all()
-            since_ms = history[:, DETECTED_MS] - last  # it may leave between ticks
+            since_ms = history[:, DETECTED_MS] - last  # a vehicle may leave between ticks
             assert ((since_ms >= 0) & (since_ms <= 200)).all()
 
 
@@ -317,7 +317,7 @@ def test_a_divided_world_equals_the_undivided_one(
 
 
 @pytest.mark.integration
-def test_results_are_the_same_on_workers_when_one_is_killed(
+def test_results_on_workers_equal_the_undivided_ones_when_a_worker_is_killed(
     undivided: tuple[str, list[str]],
 ) -> None:
     name, expected = undivided
@@ -325,7 +325,7 @@ def test_results_are_the_same_on_workers_when_one_is_killed(
 
 
 @pytest.mark.integration
-def test_results_are_the_same_over_nodes(undivided: tuple[str, list[str]]) -> None:
+def test_results_over_nodes_equal_the_undivided_ones(undivided: tuple[str, list[str]]) -> None:
     name, expected = undivided
     assert drive(name, zones=3, nodes=2, kill_at=(24,)) == expected
 

@@ -20,7 +20,7 @@ from cavmarl.handoff.simulators.zone_simulator import MOTION, ZoneSetup
 
 
 class OwnKinematics:
-    """A zone simulator: moves agents by the kinematic model, other vehicles as cavmarl requests.
+    """A zone simulator: agents move by the kinematic model, other vehicles as cavmarl requests.
 
     Attributes:
         made: all simulators in the order of their creation.

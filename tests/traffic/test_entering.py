@@ -41,7 +41,7 @@ LIMIT = float(ROADS.lanes["speed_mps"][MAIN[0]])
 
 
 def departure(lane: int = MAIN[0], **fields: Any) -> np.void:
-    """Return a waiting departure with given lane, position and speed, unless `fields` differ."""
+    """Return a waiting departure; `fields`: further fields of its record."""
     row = np.zeros(1, DEPARTURE)
     row["id"], row["agent"], row["lane"], row["speed_factor"] = 50, -1, lane, 1.0
     for field, value in fields.items():

@@ -99,7 +99,7 @@ def test_two_processes_with_one_seed_have_equal_hashes(tmp_path: Path, source: s
         second = answer(other)
     assert other.returncode == 0
     assert second[:2] == first
-    assert first[0] != first[1], "two worlds have one seed"
+    assert first[0] != first[1], "two worlds have the same seed"
     pids = [int(pid) for pid in second[2:]]
     assert len(pids) == 2
     assert all_end(pids)

@@ -221,7 +221,7 @@ def test_sumos_cars_brake_for_an_agent_that_stands(tmp_path: Path) -> None:
         assert simulation.traffic_stats().contacts == 0
 
 
-def test_agents_see_sumos_red_and_stop(tmp_path: Path) -> None:
+def test_agents_stop_at_signals_that_are_red_in_sumo(tmp_path: Path) -> None:
     """All signals are red in SUMO, but not in the programs of the map."""
     network = load("grid4x4")
     programs = "".join(

@@ -57,7 +57,7 @@ def test_messages_that_no_station_sends_cannot_be_observed(name: str) -> None:
         load_world("grid4x4", overrides={f"sensors.messages.{name}": value})
 
 
-def test_the_sensor_of_heard_vehicles_needs_messages() -> None:
+def test_the_key_sensors_conflicts_heard_needs_messages() -> None:
     settings = {"sensors.conflicts.count": 4, "sensors.conflicts.heard": True}
     with pytest.raises(ConfigError, match=r"sensors\.conflicts\.heard = True: .*set v2x\.enabled"):
         load_world("grid4x4", overrides=settings)

@@ -131,7 +131,7 @@ def test_no_threads_or_sockets_remain() -> None:
 
 
 @pytest.mark.parametrize("fault", [NetworkFault.DAMAGE, NetworkFault.SILENCE, STOP])
-def test_worlds_over_the_faulty_network_are_equal(fault: str) -> None:
+def test_worlds_over_the_faulty_network_equal_the_undivided_one(fault: str) -> None:
     found = verify_node_faults("merge", [3], faults=[fault], seeds=1, zones=3, steps=25, **SMALL)
     (line,) = found.lines
     assert found.holds

@@ -10,7 +10,7 @@ from cavmarl.verify.node_losses import verify_nodes
 from tests.cli.test_main import run
 
 
-def test_worlds_over_nodes_are_equal_while_nodes_are_killed() -> None:
+def test_worlds_over_nodes_equal_the_undivided_one_while_nodes_are_killed() -> None:
     found = verify_nodes("grid4x4", nodes=(1, 3), kills=2, steps=30, agents=4, background=30)
     assert found.holds
     assert [run.nodes for run in found.runs] == [1, 3]

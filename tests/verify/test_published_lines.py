@@ -183,7 +183,7 @@ def test_only_compared_numbers_are_covered(
     assert all(number in one for number, one in zip(left, found, strict=True))
 
 
-def test_quick_lines_have_no_requirements_and_exact_tolerances() -> None:
+def test_quick_lines_have_exact_tolerances_and_no_requirements() -> None:
     for name, line in PUBLISHED.lines.items():
         if line.is_quick:
             assert (line.needs, line.tolerance, line.by_hand) == ((), "exact", ""), name

@@ -70,7 +70,7 @@ def test_a_page_shows_the_world_that_it_asks_for(
         assert tick_of(client) % ticks == 0
         assert shown.publishers[0].published == 0
     monkeypatch.setattr(shown, "turn", None)
-    vec.step(vec.suggest_actions())  # must not call `turn` after the `with` block
+    vec.step(vec.suggest_actions())  # after the `with` block, a step must not call `turn`
 
 
 def test_showing_a_world_does_not_change_it() -> None:

@@ -88,9 +88,9 @@ def test_ghosts_reach_across_narrow_zones_and_corners() -> None:
         (0.0, 0.0, 100.0, 10.0),
         np.array([[0, 0, 49, 10], [49, 0, 51, 10], [51, 0, 100, 10]], dtype=np.float64),
     )
-    # Across a zone of 2 m.
+    # A ghost reaches across a zone that is 2 m wide.
     assert ghosts(strips, 5.0, cars(np.array([[48.0, 5.0], [40.0, 5.0]])), 0) == [[], [0], [0]]
-    # Across a corner: 3 m and 4 m give 5 m.
+    # A ghost reaches across a corner: at 3 m in x and 4 m in y, the distance is 5 m.
     car = cars(np.array([[7.0, 16.0]]))
     assert ghosts(four(), 5.0, car, 0) == [[], [0], [0], [0]]
     assert ghosts(four(), 4.9, car, 0) == [[], [0], [0], []]

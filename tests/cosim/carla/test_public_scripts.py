@@ -85,7 +85,7 @@ def output_after(process: subprocess.Popen[str], mark: str) -> str:
     return seen + interrupt(process)
 
 
-def test_config_runs(port: int) -> None:
+def test_the_script_config_py_runs(port: int) -> None:
     where = folder("PythonAPI", "util")
     for words, told in (
         (["--inspect"], "vehicles:                    8"),
@@ -99,7 +99,7 @@ def test_config_runs(port: int) -> None:
         assert process.returncode == 0
 
 
-def test_generate_traffic_runs(port: int) -> None:
+def test_the_script_generate_traffic_py_runs(port: int) -> None:
     words = ["generate_traffic.py", "--port", str(port), "-n", "10", "-w", "0", "--seed", "1"]
     where = folder("PythonAPI", "examples")
     text = output_after(start_program(words, where), "press Ctrl+C to exit")

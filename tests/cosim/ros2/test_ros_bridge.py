@@ -276,7 +276,9 @@ def test_unsupported_options_and_worlds_are_refused(
         run_bridge(RosOptions(**{"domain": domain, **options}), 1, **more)
 
 
-def test_two_vehicles_are_refused_by_a_profile_for_one(domain: int, run_bridge: Run) -> None:
+def test_two_vehicles_are_refused_by_a_profile_for_one_vehicle(
+    domain: int, run_bridge: Run
+) -> None:
     options = RosOptions(domain=domain, profile="autoware")
     with pytest.raises(ConfigError, match="2 vehicles: Autoware's topic names allow one vehicle"):
         run_bridge(options, 1, ("car_0", "car_1"))

@@ -52,8 +52,8 @@ def test_a_topic_with_another_type_is_logged_once_and_the_world_continues(
     told = [one for one in caplog.messages if "uses this topic with the type" in one]
     assert len(told) == 2
     assert (
-        "/car_0/cmd_vel: a node uses this topic with the type geometry_msgs/msg/Twist, but its "
-        "type is geometry_msgs/msg/TwistStamped" in caplog.text
+        "/car_0/cmd_vel: a node uses this topic with the type geometry_msgs/msg/Twist, but the "
+        "bridge uses geometry_msgs/msg/TwistStamped" in caplog.text
     )
     assert report["controls"]["car_0"]["received"] == 0
     assert report["steps"] == 21

@@ -119,8 +119,8 @@ def test_a_bridge_clears_the_road_below_and_is_continuous(town: Path, tmp_path: 
     result = built(town, write_geotiff(tmp_path / "flat.tif", plane(0.0, 0.0)))
     network, report = read_network(result.path), told(result)
     assert report.crossings > 0
-    # A ramp of 8 % has 62.5 m, of which 18.5 m are on the bridge. So 44 points are raised at each
-    # end.
+    # A ramp of 8 % is 62.5 m long, of which 18.5 m are on the bridge. So 44 points are raised at
+    # each end.
     assert report.ramp_places == pytest.approx(2 * 2 * 44, abs=8)
     assert report.max_grade <= 0.081
     below = [n for n, name in enumerate(network.lane_ids) if re.match(r"-?14_", name)]
