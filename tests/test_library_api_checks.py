@@ -28,6 +28,7 @@ with warnings.catch_warnings():
 
 MODES = ("closed", "open", "respawn")
 STEPS = 60
+LARGE = ("cities", "cities_sensed")  # they read 31 and 81 maps; all of their tests are slow
 BARE_MAPS = ("net/Town10HD.net.xml", "xodr/Town01.xodr", "osm/laufamholz.osm.xml")
 
 Make = Callable[..., Any]
@@ -37,15 +38,19 @@ def worlds(*often: str, modes: tuple[str, ...] = MODES, bare: tuple[str, ...] = 
     """Return a mark that parametrizes a test by environment and population mode.
 
     The first mode, and all modes of the environments in `often`, are in every run of the tests. The
-    other variants are slow tests.
+    other variants, and those of `LARGE`, are slow tests.
     """
+
+    def is_slow(source: str, mode: str) -> bool:
+        return source in LARGE or not (mode == modes[0] or source in often)
+
     return pytest.mark.parametrize(
         "arguments",
         [
             pytest.param(
                 (source, mode),
                 id=f"{mode}-{source}",
-                marks=[] if mode == modes[0] or source in often else pytest.mark.slow,
+                marks=pytest.mark.slow if is_slow(source, mode) else [],
             )
             for source in (*sorted(entries()), *bare)
             for mode in modes

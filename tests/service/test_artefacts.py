@@ -65,7 +65,7 @@ def configure(fleet: Fleet, files: dict[str, str], **given: Any) -> str:
         ("code.py", b"import os", "code is never"),
         ("model.pt", b"x", "code is never"),
         ("map.net.xml", b"import os", "syntax error"),
-        ("map.net.xml", b"<configuration><input/></configuration>", "names other files"),
+        ("map.net.xml", b"<configuration><input/></configuration>", "only names files"),
         ("map.net.xml", b"<net>\0", "is no .xml file"),
         ("map.net.xml", b"<net><a></net>", "mismatched tag"),
         ("map.net.xml", b"<!DOCTYPE net [<!ENTITY a SYSTEM '/etc/passwd'>]><net>&a;</net>", "DOCT"),
