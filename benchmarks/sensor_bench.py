@@ -1,4 +1,7 @@
-"""One vehicle with sensors over several numbers of sensor workers, with new processes per run."""
+"""Measure one vehicle with sensors with several numbers of sensor workers, one after another.
+
+Each run has new processes.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +58,8 @@ class SensorBench:
     seed: int  # seed of every run, and of their order
     placement: str  # placement of sensors: by `cost` or `in_turn`
     turns: tuple[Turn, ...]  # all runs, in order
-    # speedup of independent programs, one per worker, at most one per core; None: one program
+    # speedup of independent programs that run at once: as many as the largest number of sensor
+    # workers that is not above the number of cores; None: this number is 1
     ceiling: CoreCeiling | None
 
     def of(self, workers: int) -> list[SensorRun]:

@@ -3,8 +3,8 @@
 PettingZoo: the module functions `parallel_env`, `env` and `raw_env`, and, from version 1.27 on,
 ids such as `cavmarl/merge-v6` in its two registries. Gymnasium: `cavmarl/merge-v6` is a
 single-agent environment with one vehicle of the world, and `cavmarl/mergeAgents-v6`, for
-`gymnasium.make_vec`, has all agents as rows. `cavmarl/mergeDiscrete-v2` and
-`cavmarl/mergeDiscreteAgents-v2` use meta-actions. highway-env's tasks keep their names: `merge-v0`
+`gymnasium.make_vec`, has all agents as rows. `cavmarl/mergeDiscrete-v6` and
+`cavmarl/mergeDiscreteAgents-v6` use meta-actions. highway-env's tasks keep their names: `merge-v0`
 is `cavmarl-highway/merge-v0`.
 """
 

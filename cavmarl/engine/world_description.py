@@ -26,8 +26,9 @@ def describe_world(
 ) -> dict[str, Any]:
     """Return the configuration, and the hashes of the roads, demand, zones and kernels.
 
-    `demand_tolerated` lists what was left out or replaced in the demand, with counts. If networks
-    drive background vehicles, `background_drivers` has the SHA-256 of their files by name.
+    `demand_tolerated` lists what was left out or replaced in the demand, with counts. If trained
+    drivers drive background vehicles, `background_drivers` has the SHA-256 of each driver's files,
+    by the name of the driver.
     """
     drivers = {one.name: one.content_hash for one in background_drivers(config.traffic)}
     resolved = asdict(config)

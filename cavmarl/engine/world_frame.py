@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -47,7 +47,7 @@ SEEN = np.dtype(
         ("target_zone", "<i2"),  # target of the transfer in flight; -1: none
         ("driver", "i1"),
         ("blinker", "i1"),
-        ("transfer", "i1"),
+        ("transfer", "i1"),  # 1: a transfer is in flight
     ]
 )
 # An agent whose trip ended in the step before the frame, and the EVENT_* bits that ended it.
@@ -115,6 +115,8 @@ def frame_of(
     order = np.argsort(rows["id"], kind="stable")  # fast for ids that are almost sorted
     write_seen(rows, order, simulation.types, seen)
     view = simulation.zones.view(world) if simulation.partition.count > 1 else None
+    if view is not None:
+        _mark_transfers(seen, view.transfers)
     tick = int(simulation.ticks()[world])
     return WorldFrame(
         world,
@@ -128,6 +130,14 @@ def frame_of(
         asked,
         override_columns(simulation.config, simulation.network),
     )
+
+
+def _mark_transfers(seen: NDArray[np.void], transfers: Sequence[TransferInFlight]) -> None:
+    """Write the target zones of vehicles in transfer into SEEN (n,), which is ordered by id."""
+    targets = {transfer.vehicle: transfer.target for transfer in transfers}
+    moving = np.flatnonzero(np.isin(seen["id"], list(targets)))
+    seen["target_zone"][moving] = [targets[int(number)] for number in seen["id"][moving]]
+    seen["transfer"][moving] = 1
 
 
 def events_between(before: WorldFrame, after: WorldFrame) -> Iterator[FrameEvent]:

@@ -18,7 +18,8 @@ from cavmarl.signals.signal_table import SignalTable
 
 PREFIX = "signal_"  # prefix of these agents' ids, followed by the signal's id
 
-SIGNALS = "signals"  # key of the arrays of an environment in which signals have agents
+# Key of the arrays of the signals' agents, beside `roadside_agents.VEHICLES`.
+SIGNALS = "signals"
 
 
 class SignalAgents(RoadsideAgents):

@@ -11,15 +11,15 @@ _PACKAGE = Path(__file__).parents[1]
 _DECORATORS = {"kernel", "inlined_kernel"}
 # Functions and classes that make kernels, or collect kernels for other kernels.
 _FACTORIES = {"for_each_zone", "acceleration_model", "CarFollowingModel"}
-_CORE = ("core.math", "core.records")  # folders of kernels besides all folders `kernels`
+_CORE = ("core.math", "core.records")  # packages of kernels that are not named `kernels`
 
 
 def called_kernels() -> frozenset[str]:
     """Return the names of all kernels that modules of the package call from Python.
 
-    The sources are searched for kernels that a module outside of the folders of kernels imports or
-    defines, and for kernels that plain functions in the same file call
-    (`roads.kernels.plans.plan_goal`).
+    A kernel counts as called if a module outside of the folders of kernels imports or defines it,
+    or if a function in its own file that is not a kernel calls it (such as
+    `roads.kernels.plans.plan_goal`).
     """
     trees = {_module_of(path): ast.parse(path.read_bytes()) for path in _PACKAGE.rglob("*.py")}
     defined = {module: set(_defined(tree)) for module, tree in trees.items()}

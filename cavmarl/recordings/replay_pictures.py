@@ -38,7 +38,10 @@ class ReplayPictures:
         self._ghosts_of = ghosts_of
         count = self._partition.count
         if ghosts_of is not None and not (count > 1 and 0 <= ghosts_of < count):
-            raise ConfigError(f"ghosts_of = {ghosts_of}: must be from 0 to {count - 1}")
+            raise ConfigError(
+                f"ghosts_of = {ghosts_of}: must be from 0 to {count - 1}, in a world with several "
+                "zones"
+            )
         self._renderer = TopDownRenderer(recording.network)
         self.fps = max(1, round(1.0 / head.step_s))
 

@@ -79,7 +79,7 @@ def verify_nodes(
     Args:
         env: see `make_vec`, also for the other keywords; `seed` also seeds the kills.
         nodes: numbers of nodes, one run each.
-        kills: number of nodes killed by SIGKILL at random times in each run; at most all but one.
+        kills: number of nodes killed by SIGKILL at random times in each run; one node is spared.
         zones: number of zones of each world; default: twice the largest number of nodes.
         worlds: number of worlds stepped together.
         steps: number of steps of each run.
@@ -189,7 +189,7 @@ class ComparedWorlds:
         )
 
     def signal_node(self, drawn: random.Random, number: signal.Signals) -> bool:
-        """Send a signal to a random node that has received none. Return whether there is one."""
+        """Send a signal to a random node that has received none. Return whether it was sent."""
         living = [pid for pid in self.worlds.pool.pids if pid not in self._signalled]
         if living:
             pid = drawn.choice(living)

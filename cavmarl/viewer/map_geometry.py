@@ -64,10 +64,11 @@ def map_origin(network: RoadNetwork) -> NDArray[np.float64]:
 def map_message(network: RoadNetwork) -> bytes:
     """Encode a map for the page.
 
-    Sections: `roads` and `lines` (PIECE), `surfaces` and `buildings` (CORNER, three per triangle),
-    `stop_lines` (STOP_LINE), `phase_states` (uint8 positions in `SIGNAL_STATES`) and `phase_first`
-    (uint32). A signal shows `phase_states[phase_first[phase] + letter]`, unless the frame
-    has a state that a program has set for the link of the stop line (`stop_links`, uint32).
+    Sections: `roads` and `lines` (PIECE), `surfaces`, `marks` and `buildings` (CORNER, three per
+    triangle), `stop_lines` (STOP_LINE), `stop_links` (uint32, the link of each stop line),
+    `phase_states` (uint8 positions in `SIGNAL_STATES`) and `phase_first` (uint32). A stop line
+    shows `phase_states[phase_first[phase] + letter]`. If a program has set another state for its
+    link, the frame contains this state, and the stop line shows it.
     """
     shapes = road_shapes(network)
     origin = map_origin(network)

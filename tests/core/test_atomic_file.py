@@ -103,7 +103,7 @@ def test_a_draft_that_is_removed_before_it_is_locked_is_made_again(
         assert folder.is_dir()
 
 
-def test_if_locks_fail_files_are_written_and_no_draft_is_removed(
+def test_without_locks_files_are_written_and_no_draft_is_removed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse_the_lock(*_: object) -> None:

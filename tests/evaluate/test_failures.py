@@ -182,7 +182,7 @@ def test_names_with_markup_cannot_end_the_script_of_the_page(tmp_path: Path) -> 
     assert data_of(tmp_path / "page.html")["failures"][0]["policy"] == name
 
 
-def test_the_worst_trips_are_shared_among_the_causes() -> None:
+def test_the_worst_trips_of_each_cause_are_chosen_in_turn() -> None:
     failures = [
         Failure(cause, float(k), {}, {}) for cause in ("collision", "slow") for k in range(10)
     ]

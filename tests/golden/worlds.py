@@ -3,9 +3,10 @@
     python -m tests.golden.worlds [ROW ...]
 
 This command writes `worlds.json`, and `test_golden.py` compares results with this file. A row is a
-world that a driver drives for some steps. The results of a row have several parts; the bytes of a
-part, in a fixed order and without names, give one hash. `WAYS` are divisions of a world, which must
-have the same hashes. Names of cavmarl that may change are at the top.
+world that a driver drives for some steps. The results of a row have several parts; each part has
+one hash, of its arrays in a fixed order, without their names. `WAYS` are divisions of a world,
+which must have the same hashes. The names of cavmarl that a run uses are constants at the top,
+because a change may rename them.
 """
 
 from __future__ import annotations
@@ -152,7 +153,7 @@ def recorded() -> dict[str, dict[str, str]]:
 
 
 def main() -> None:
-    """Record the rows that the command line names, or all rows without a name."""
+    """Record the rows that the command line names; if it names none, all rows."""
     parser = argparse.ArgumentParser(description="Record golden rows.")
     parser.add_argument("rows", nargs="*", metavar="ROW", help=" ".join(ROWS))
     names = parser.parse_args().rows

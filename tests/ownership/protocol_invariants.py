@@ -1,7 +1,8 @@
 """Check invariants of the protocol on the states of coordinator and hosts while they run.
 
 The monitor is told which vehicles a host advances, and checks the states before and after each
-tick. It visits every vehicle, so it is slow.
+tick. It visits every vehicle, so it is slow. I1 to I10 number the invariants; each check below
+states its own, `explorer.py` has I4, and `scenarios.py` I8.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ class Monitor:
         self._tick = -1
 
     def advanced(self, zone: int, incarnation: int, tick: int, vehicles: Iterable[int]) -> None:
-        """Check I1: in a tick, only one zone advances a vehicle, and each process does so once."""
+        """Check I1: in a tick, only one zone advances a vehicle; no process executes it twice."""
         if tick > self._tick:
             self._tick, self._writers = tick, {}
         if self._executed.get((zone, incarnation), -1) >= tick:

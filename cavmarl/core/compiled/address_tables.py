@@ -9,8 +9,8 @@ from typing import Any
 class AddressTable:
     """A table that kernels know by its symbol.
 
-    Each loader of kernels has its own copy of the table: LLVM's loader of objects uses the copy of
-    this class, and each shared library contains a copy.
+    The table has several copies, which all have the same content. Kernels that LLVM loads use the
+    copy that this class makes. Each shared library of kernels contains a copy for its own kernels.
     """
 
     def __init__(self, symbol: str, size: int) -> None:
@@ -29,7 +29,7 @@ class AddressTable:
             copy[row] = address
 
     def add_copy(self, library: ctypes.CDLL) -> None:
-        """Fill the copy of a library, if it has one, and keep it up to date."""
+        """Fill the table's copy in a library, if there is one, and keep it up to date."""
         if not hasattr(library, self.symbol):
             return
         copy = (ctypes.c_int64 * self.size).in_dll(library, self.symbol)

@@ -23,7 +23,9 @@ _TYPED = _C | _F | _ALIGNED | _WRITEABLE
 # An array that is contiguous in both orders, such as one with a single item, counts as C order.
 _FLAGS = {bits: bits & ~_F if bits & _C else bits for bits in range(_TYPED + 1)}
 _SIGNED_LIMIT = 1 << 63
-_VOID_DATA = tuple.__basicsize__  # offset of the data pointer in a NumPy record, after its header
+# Offset of the data pointer in a NumPy record: it follows the header of objects of variable size,
+# which is all that a tuple without items has.
+_VOID_DATA = tuple.__basicsize__
 
 
 class Words:
@@ -57,7 +59,11 @@ class ArgumentType:
         self.count = count
 
     def fits(self, new: Any, last: Any = None) -> bool:
-        """Return whether an argument has this type; `last`, if given, is known to have it."""
+        """Return whether an argument has this type.
+
+        `last`: an earlier argument that has this type; None: not known. Items that are the same
+        objects in both are not checked again.
+        """
         return bool(type_of(new).text == self.text)
 
     def write(self, words: Words, at: int, new: Any) -> None:

@@ -14,7 +14,8 @@ Three changes shorten the first compilation (decision 002):
   callable, caches it and optimises it.
 - A bundle of arrays is passed as one address and read in place. Numba passes each array as seven
   numbers, and rebuilds the bundle in the called function. A bundle that a kernel creates is stored
-  where it is assigned, once for all calls; the next execution of that line overwrites it.
+  once, when it is assigned, and not again for each call that it is passed to; the next execution of
+  that line overwrites it.
 - Without reference counts, no code is generated for the end of a variable's life.
 """
 
@@ -81,7 +82,9 @@ def _is_bundle(kind: Any) -> bool:
 
 
 def _borrow(builder: Any, address: Any, is_fixed: bool) -> Any:
-    """Load the value at an address as borrowed; LLVM reads only the parts that are used.
+    """Load the value at an address, and mark it as borrowed: used in place, not copied.
+
+    LLVM reads only the parts that are used.
 
     `is_fixed`: whether the address and the value there are the same in the whole function.
     """
@@ -147,7 +150,8 @@ class _KernelLower(_Lower):  # type: ignore[misc]
         """Count the assignments of each variable."""
         super().init()
         self._bundles: dict[str, Any] = {}
-        self._addresses: dict[str, Any] = {}  # variables with the address of one of several bundles
+        # by variable: where the address of its present bundle is stored; see `storevar`
+        self._addresses: dict[str, Any] = {}
         self._fields: dict[tuple[Any, int], Any] = {}
         blocks = self.blocks.values()
         self._assigned = Counter(
@@ -164,7 +168,7 @@ class _KernelLower(_Lower):  # type: ignore[misc]
                 argument.attributes.dereferenceable = self.context.get_abi_sizeof(kind.pointee)
 
     def lower_expr(self, resty: Any, expr: Any) -> Any:
-        """Read a field of a bundle from its own address."""
+        """Read a field of a borrowed bundle at the field's address, without the whole bundle."""
         if expr.op == "getattr" and not self.context.enable_nrt:
             kind = self.typeof(expr.value.name)
             bundle: Any = self.loadvar(expr.value.name) if _is_bundle(kind) else None
@@ -304,7 +308,7 @@ class _KernelLowering(NativeLowering):
         return _KernelLower
 
     def run_pass(self, state: Any) -> bool:
-        """Lower to LLVM; other kernels then find a part by a key instead of an address."""
+        """Lower to LLVM; register a part by a key, because it has no address, for its callers."""
         flags = state.flags
         is_part = flags.no_cpython_wrapper
         library = _Part if is_part else _Whole
@@ -330,7 +334,7 @@ class _QuickFlags(_Flags):  # type: ignore[misc]
     __slots__ = ()
 
     def copy(self) -> Any:
-        """Return flags for a called function, without its caller's inlining and storage."""
+        """Return flags for a called function, without how its caller is inlined and built."""
         flags = super().copy()
         for name in ("forceinline", "no_compile", "no_cpython_wrapper"):
             flags.discard(name)

@@ -1,4 +1,4 @@
-"""Angles with a known maximum error, for bounds that need no accuracy."""
+"""Approximate angles with a known maximum error, for bounds that are widened by this error."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def rough_atan2(y: float, x: float) -> float:
     """Return the angle of a point other than (0, 0), with an error below `ANGLE_ERROR_RAD`.
 
     Rajan, Wang, Inkol, Joyal: "Efficient approximations for the arctangent function", IEEE Signal
-    Processing Magazine 23(3), 2006, their equation for 0.0038 rad.
+    Processing Magazine 23(3), 2006, the equation with an error of at most 0.0038 rad.
     """
     across = abs(y)
     along = abs(x)

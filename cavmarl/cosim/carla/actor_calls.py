@@ -350,7 +350,7 @@ def set_vehicle_light_state(
     session.actors.find(number, "set_vehicle_light_state").lights = mask[0] & 0xFFFFFFFF
 
 
-@call("get_physics_control", actor_id, note="typical values, except the positions of the wheels")
+@call("get_physics_control", actor_id, note="typical values; positions of the wheels from the pose")
 def get_physics_control(caller: Caller, session: CarlaSession, number: int) -> list[Any]:
     if not session.version.has_wheel_physics:
         raise CallRefused("the physics of vehicles of CARLA 0.10 are not available")

@@ -76,7 +76,7 @@ def set_episode_settings(caller: Caller, session: CarlaSession, given: tuple[Any
 
 @call(
     "tick_cue",
-    note="by default, each cue of each client is a tick; without synchronous mode, only an answer",
+    note="each call runs a tick, if `--other-ticks` permits; no effect in asynchronous mode",
 )
 def tick_cue(caller: Caller, session: CarlaSession) -> int:
     return session.tick_for(caller) if session.settings.synchronous else session.frame + 1

@@ -16,7 +16,7 @@ def decode_pairs(
     mask: NDArray[np.bool_],  # (W, A) agents whose actions are read; others count as 0
     acceleration_mps2: float,  # acceleration at throttle 1
     steering_rad: float,  # steering angle at steering 1
-    last: NDArray[np.float64],  # (W, A, 2) is written, the actions
+    last: NDArray[np.float64],  # (W, A, 2) is written: the decoded throttle and steering
     controls: NDArray[np.float64],  # (W, A, 2) is written, m/s² and rad
 ) -> bool:  # whether all actions are within [-1, 1]; NaN is not
     """Decode throttle and steering in [-1, 1]. Write nothing if an action is out of range."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import kernel
 from cavmarl.core.records.arrays import RoadArrays
 
-MIN_SPEED_MPS = 1.0  # least speed with which the entry of a front is extrapolated backwards
+MIN_SPEED_MPS = 1.0  # a slower vehicle counts as this fast when entry and exit are extrapolated
 
 
 @kernel
@@ -55,7 +55,9 @@ def _place_on_link(roads: RoadArrays, row: np.void) -> tuple[int, float]:
 
 @kernel
 def _stay(conflict: np.void, row: np.void, centre_m: float, dt: float) -> tuple[float, float]:
-    """Return for how many s a vehicle has covered an area, and will cover it; else (-1, -1).
+    """Return for how many s a vehicle has covered an area, and for how many it still will.
+
+    If it does not cover the area now, the result is (-1, -1).
 
     The vehicle is assumed to keep its present speed. Times are limited to the step, because other
     steps cover the rest. The first time is not limited in the step in which the centre passes the

@@ -1,8 +1,9 @@
 """`InvariantMonitor`: checks of the invariants of ownership after every tick of every world.
 
-One compiled pass over the rows (`kernels.invariant_checks`) sums up the vehicles, and finds
-vehicles that have entered or left. The expected owners come from the coordinators' records, at a
-cost that grows with the changes. `coordinator.violations` describes violations in detail.
+One compiled pass over the rows (`kernels.invariant_checks`) adds up hashes of the vehicles by zone,
+and finds vehicles that have entered or left. The expected owners come from the coordinators'
+records, at a cost that grows with the changes. `coordinator.violations` describes violations in
+detail.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ class OwnersOnRecord:
     Attributes:
         entered: number of vehicles that have entered.
         left: number of vehicles that have left.
-        ask: lets the coordinator make its outstanding records.
+        ask: function that makes the coordinator write its outstanding records.
     """
 
     def __init__(
@@ -158,7 +159,7 @@ class InvariantMonitor:
         _, count, num_worlds, capacity = division.zoned.rows.shape
         self._ticks = [0] * num_worlds
         self._vehicles: list[set[int]] = [set() for _ in range(num_worlds)]
-        # The results of the last check and of the previous check.
+        # The results of the last check and of the check before it.
         self._kept = [
             (make_kept(count, capacity), make_kept(count, capacity)) for _ in range(num_worlds)
         ]

@@ -25,7 +25,8 @@ class JournalSummary:
     births: int = 0  # vehicles that entered
     removals: int = 0  # vehicles that left
     switches: int = 0  # changes of owner
-    forced: int = 0  # changes of owner with attached state, since the target was not ready in time
+    # changes of owner that carried the vehicle's state, since the target was not ready in time
+    forced: int = 0
     deferrals: int = 0  # ticks that vehicles spent with an owner whose zone they had left, summed
     hosts: int = 0  # assignments of a zone to a process
     fences: int = 0  # processes that were fenced: their messages are dropped

@@ -46,10 +46,10 @@ class NodePeers(Peers):
     node.
 
     Attributes:
-        own: (W, A) agents for which this node sensed last.
+        own: (W, A) agents whose newest observation this node has computed.
         stepped: (W, A) `own` at the end of the last step, before the autoreset.
         checks: refuses bad rows of other nodes.
-        owner: (W · A,) node that sensed last for each agent; `UNOWNED`: none.
+        owner: (W · A,) node that has computed each agent's newest observation; `UNOWNED`: none.
     """
 
     are_none = False
@@ -112,7 +112,7 @@ class NodePeers(Peers):
             zoned.num_outer[zone, chosen] = -1
         for zone in range(len(zoned.num_rows)):
             for w in np.flatnonzero(chosen).tolist():
-                # The first zone had all vehicles, so it has rows beyond its present number of rows.
+                # Release unused rows: a reset puts all vehicles into the first zone at first.
                 num = zoned.num_rows.item(zone, w)
                 for array in (*zoned.rows[:, zone, w], *(each[zone, w] for each in self._of_rows)):
                     forget(array[num:])
@@ -276,7 +276,7 @@ class NodePeers(Peers):
             yield
 
     def _agents_of(self, side: int) -> Array:
-        """Return (n,) agents whose vehicles are here, numbered through all worlds."""
+        """Return (n,) agents whose vehicles are here, as indices into (W · A,) arrays."""
         zoned, num_agents = self._zoned, self.own.shape[1]
         found = [
             agents[agents >= 0].astype(np.int64) + w * num_agents

@@ -289,8 +289,8 @@ class LocalWorlds:
         A copy has no journal, since the file belongs to the original.
 
         Raises:
-            ConfigError: the worlds have processes of their own, or use extensions that the process
-                that reads a pickle could not register.
+            ConfigError: the worlds have processes of their own, or use an extension of a module
+                that another process, which reads the pickle, could not import.
         """
         config = self.world.config
         if key := kept_elsewhere(config):
@@ -324,7 +324,10 @@ class LocalWorlds:
         self.simulation.messages.connect(network)
 
     def keep_logs(self) -> tuple[ToldLog, ...]:
-        """Log the commands to SUMO, which `load` needs: one log per world; see `SumoTraffic`."""
+        """Start and return logs of what SUMO receives, one per world, which `load` needs.
+
+        See `SumoTraffic.keep_logs`.
+        """
         sumo = self.simulation.sumo
         return () if sumo is None else sumo.keep_logs()
 
@@ -341,7 +344,8 @@ class LocalWorlds:
     def save_worlds(self) -> list[bytes]:
         """Return the state of each world, for `load_worlds` with any zones and workers.
 
-        Worlds with the same zones keep the owners. A journal records the start of an episode.
+        After `load_worlds`, vehicles keep their owners if the zones are the same, and a journal
+        begins a new episode, because the saved state has no place in a journal.
         """
         zones = self.world.partition.count
         saved = []
@@ -380,7 +384,7 @@ class LocalWorlds:
 
     @property
     def num_parts(self) -> int:
-        """Number of arrays at the end of `save` that exist for each zone of each world."""
+        """Number of the last arrays of `save`, of which each zone of each world has one."""
         return len(self._steps) * self.world.partition.count
 
     @property

@@ -68,7 +68,7 @@ def vehicle_class(element: Element) -> str:
 def vtype_record(
     element: Element, report: DemandReport, defaults: Mapping[str, str] | None = None
 ) -> NDArray[np.void] | None:
-    """Return VTYPE () of a <vType>; None for a class that does not use roads.
+    """Return the VTYPE record of a <vType>; None for a class that does not use roads.
 
     `defaults`: default attributes of types.
 
@@ -80,7 +80,7 @@ def vtype_record(
             attrs = {**child.attrs, **attrs}
             attrs.setdefault("carFollowModel", child.name.removeprefix(_MODEL_PREFIX))
     for key, value in (defaults or {}).items():
-        # A distribution of speed factors contains its deviation.
+        # The default speedDev must not replace the deviation in norm(…) or normc(…).
         if key != "speedDev" or not _SPEED_FACTOR.fullmatch(attrs.get("speedFactor", "").strip()):
             attrs.setdefault(key, value)
     element = Element(element.name, attrs, element.path, element.line, element.children)
@@ -197,7 +197,7 @@ class TypeTable:
             self._types.setdefault(name, Element("vType", {"id": name, "vClass": vclass}, "", 0))
 
     def options(self, name: str, user: Element) -> Options | None:
-        """Return the choice of types with a name; None if these types do not use roads.
+        """Return the types that a name stands for, with weights; None if none of them uses roads.
 
         `name`: name of a type or a distribution. `user`: the element that contains the name.
 

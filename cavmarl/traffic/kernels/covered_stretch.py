@@ -17,7 +17,10 @@ def covered_stretch(
     lane: np.void,  # LANE
     body: NDArray[np.float64],  # (n, 2) sample points of the body, m
 ) -> tuple[float, float]:
-    """Return the first and last position of the lane below the body; inf first if none."""
+    """Return the first and last position on the lane that the body covers, in m.
+
+    If it covers none, return (inf, -inf).
+    """
     reach = 0.5 * lane["width_m"]
     first, last = math.inf, -math.inf
     for k in range(len(body)):

@@ -1,7 +1,8 @@
 """The vehicles of a logged scene as agents, replayed vehicles and built-in drivers.
 
-A replayed vehicle is posed as if by the caller of the environment (`ExternalComponent`). A vehicle
-that reacts is a departure of a demand file, with the logged path as its route.
+A replayed vehicle has the poses of the log, as if the caller of the environment had set them (see
+`ExternalComponent`). A vehicle that reacts is a departure of a demand file, with the logged path as
+its route.
 """
 
 from __future__ import annotations
@@ -201,7 +202,10 @@ class _Casting:
         return bool(boxes_meet(poses, half)[number].any())
 
     def _goal(self, track: Track, start: LanePlace) -> tuple[int, int]:
-        """Return the last tried sample whose edge is reachable from the start, and that edge."""
+        """Return the latest tried sample whose edge is reachable from the start, and that edge.
+
+        If there is none, return the first sample and the edge of the start.
+        """
         times = track.times[track.times >= self._first][::-1]
         tried: set[int] = set()
         for time in times[::GOAL_STEPS].tolist():
@@ -260,7 +264,11 @@ def clipped_size(track: Track) -> tuple[float, float, float]:
 
 
 def speeds_of(track: Track, step_s: float) -> NDArray[np.float64]:
-    """Return (T,) speeds in m/s along the heading, from the previous sample or else to the next."""
+    """Return the speeds (T,) along the heading in m/s.
+
+    A speed is the mean since the previous sample; if that is missing, the mean until the next
+    sample; if both are missing, 0.
+    """
     moves = np.diff(track.poses[:, :2], axis=0)
     heading = track.poses[:, 2].tolist()
     speeds = np.zeros(len(track.valid))
@@ -285,10 +293,12 @@ def type_of(track: Track) -> str:
 def logged_commands(
     traffic: LoggedTraffic | None, type_rows: Mapping[str, int], step_s: float
 ) -> NDArray[np.void]:
-    """Return EXTERNAL (K + 2, L): the commands for the replayed road users.
+    """Return EXTERNAL (K + 2, L): the commands of K steps for L replayed road users.
 
     Row 0 is the state at the reset, and row k the command of step k - 1. The last row removes all
-    users. `step_s`: duration of a step, between whose ends poses are interpolated.
+    users. Poses at the ends of steps are interpolated between samples of the log.
+
+    `step_s`: duration of a step.
     """
     if traffic is None:
         return np.zeros((1, 0), dtype=EXTERNAL)
