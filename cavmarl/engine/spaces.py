@@ -235,10 +235,6 @@ def observation_table(config: SensorsConfig) -> str:
         if sensor.name in places:
             start = places[sensor.name].start
             lines += _lines(sensor.name, start, sensor.features(config))
-    if any("…" in line.split("|")[1] for line in lines):
-        lines += ["", "A row with several indices describes the first of them."]
-    if any("abs(" in line for line in lines):
-        lines += ["", "The formulas in the last column give the feature of the value `x` or `v`."]
     return "\n".join(lines)
 
 
