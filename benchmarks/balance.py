@@ -99,9 +99,9 @@ def _report(found: BalanceReplay, kind: str) -> BenchmarkReport:
                 for verdict in verdicts
             ),
             "calibrated, mean: {:.2f} CPU + {:.2f} RAM + {:.2f} GPU".format(*fitted),
-            "calibrated, predicted and re-cut extend balanced; perfect: if every shard could be "
-            f"divided at will; assumed: {1e3 * found.rule.move_s:g} ms per move, "
-            f"{found.ticks} ticks per round, other load on workers",
+            "calibrated, predicted and repartitioned extend balanced; perfect: if every shard "
+            f"could be divided at will; {found.ticks} ticks per round; assumed: "
+            f"{1e3 * found.rule.move_s:g} ms per move, and the load of other programs on workers",
         ],
         facts={"recorded": kind == "recorded", "rule": asdict(found.rule), "ticks": found.ticks},
     )

@@ -32,7 +32,9 @@ class Placed:
 
 
 class StaticPlacement:
-    """The paper's baseline: shards are placed once, before any measurement, and never move.
+    """The baseline of paper A: shards are placed once, before any measurement, and never move.
+
+    See `docs/explanation/papers.md`.
 
     Args:
         trace: the loads.

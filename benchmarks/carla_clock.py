@@ -1,8 +1,9 @@
 """The clocks of two of CARLA's clients that share a world: one client ticks, one follows.
 
-The world is cavmarl's, behind its server for CARLA's client; SUMO can move its traffic. As in the
-co-simulation paper, three programs are in lock step: SUMO, the world in place of CARLA, and the
-clients. In a share of the steps, the second client also ticks, like the paper's bridge.
+The world is cavmarl's, behind its server for CARLA's client; SUMO can move its traffic. As in paper
+B (`docs/explanation/papers.md`), three programs are in lock step: SUMO, the world in place of
+CARLA, and the clients. In a share of the steps, the second client also ticks, like the paper's
+bridge.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ def measure(
     csv_path: Annotated[Path | None, about_file("Write the table to this file.", "--csv")] = None,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Compare the clocks of two of CARLA's clients that share a world (Table II)."""
+    """Compare the clocks of two of CARLA's clients that share a world (Table II of paper B)."""
     say(f"{steps} steps")
     found = measure_client_drift(
         world, steps=steps, rogue=rogue, other_ticks=other_ticks, sumo=sumo

@@ -44,7 +44,7 @@ class Load(NamedTuple):
     name: str
     vehicles: int
     sensors: tuple[dict[str, Any], ...]
-    at_least: float  # ticks per second, on an idle machine
+    at_least: float  # required ticks per second on an idle machine; shown, but not checked
 
 
 LOADS = (

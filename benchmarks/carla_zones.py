@@ -1,4 +1,4 @@
-"""Hand-overs between zones that servers for CARLA's client run: rates and latencies.
+"""Rates and latencies of hand-overs between zones, which run in servers for CARLA's client.
 
 The benchmark repeats the hand-overs of paper A, Table 4 (`docs/explanation/papers.md`). Each zone
 of a world has a process with a server, and a process with CARLA's official client.

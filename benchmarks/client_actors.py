@@ -67,7 +67,7 @@ def measure(
         ],
         facts={"others_equal": is_equal},
         holds=is_equal and at_once,
-        caption="present: all actors are in the world; steps: the largest number of all visits",
+        caption="present: all actors are in the world; steps until present: maximum of all visits",
     )
 
 

@@ -31,7 +31,7 @@ def measure(
     csv_path: Annotated[Path | None, about_file("Write the table to this file.", "--csv")] = None,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Compare a master's clock with that of a follower in another process (Table II)."""
+    """Compare a master's clock with that of a follower in another process (Table II of paper B)."""
     say(f"{steps} steps")
     found = measure_drift(world, steps=steps, rogue=rogue, answer=own_ticks, pace=pace)
     if csv_path is not None:

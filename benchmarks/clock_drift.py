@@ -1,7 +1,7 @@
 """Drift between a time master's clock and that of a follower in another process (Table II).
 
-The table is that of the co-simulation paper. Each clock is read in its own process; the follower's
-clock is derived from the messages it gets.
+The table is that of paper B (`docs/explanation/papers.md`). Each clock is read in its own process;
+the follower's clock is derived from the messages it gets.
 """
 
 from __future__ import annotations

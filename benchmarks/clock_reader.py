@@ -4,7 +4,7 @@
 
 The follower ticks on its own in SHARE of the steps, evenly spread. At the end, it prints one line
 of JSON: the world's tick that it knew when it joined and after each step, its own process clock in
-seconds since it joined, and the number of refused own ticks.
+seconds since it joined, and the numbers of its own ticks and of those that were refused.
 """
 
 from __future__ import annotations

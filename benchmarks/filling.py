@@ -34,7 +34,7 @@ def write_filling_demand(
 
 
 def _ends(network: RoadNetwork, links: str) -> list[str]:
-    """Return the ids of roads without lanes in `links`."""
+    """Return the ids of roads whose lanes all have 0 in `links`, a column of the lanes."""
     lanes, edges = network.lanes, network.edges
     linked: NDArray[np.int64] = np.bincount(lanes["edge"], lanes[links], len(edges))
     return [network.edge_ids[e] for e in np.flatnonzero((linked == 0) & ~edges["internal"])]

@@ -172,7 +172,7 @@ def _vehicles(drivers: str, agents: int) -> Sequence[object]:
 
 
 def _savings(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return lines with the savings by advice over learned signals alone, paired by world."""
+    """Return lines that say what advice saves over learned signals alone, paired by world."""
     alone = next((row for row in rows if row["side"] == "signals"), None)
     found = []
     for row in rows:
@@ -190,7 +190,7 @@ def _savings(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _figures(found: Sequence[Driving]) -> dict[str, Any]:
-    """Return the means over worlds, the half widths of their 95 % intervals, and each world."""
+    """Return means over worlds, half widths of their 95 % intervals, and each world's values."""
     values = np.array(found)
     kilometres = 1e-3 * values[:, Driving._fields.index("distance_m")]
     per_km = values / kilometres[:, None]

@@ -114,8 +114,8 @@ def _report(
     ratio = paired_ratio(fixed["step_ms"], moving["step_ms"])
     processor_ratio = fixed["busiest_ms"] / moving["busiest_ms"]
     return BenchmarkReport(
-        f"{env}: {len(vehicles)} worlds over {workers} workers; {half} of "
-        f"{statistics.fmean(vehicles[:half]):.0f} vehicles, {len(vehicles) - half} of "
+        f"{env}: {len(vehicles)} worlds over {workers} workers; {half} with "
+        f"{statistics.fmean(vehicles[:half]):.0f} vehicles, {len(vehicles) - half} with "
         f"{statistics.fmean(vehicles[half:]):.0f}",
         {
             "worlds": "name",

@@ -47,7 +47,7 @@ class Caches(NamedTuple):
     cores: int
 
     def beyond(self, rows: float, busy: int) -> tuple[float, float]:
-        """Return how many rows of a core exceed its own cache, and its share of all caches."""
+        """Return how many rows of a core exceed its own cache, and how many its shared part."""
         share = self.shared / max(min(busy, self.cores), 1)
         return max(rows - self.own, 0.0), max(rows - share, 0.0)
 
@@ -60,7 +60,7 @@ class NodeCosts:
     ghost_s: float  # processor time per ghost
     whole_s: float  # processor time of an undivided tick, constant part
     vehicle_s: float  # processor time per vehicle
-    far_s: float  # additional time per row, including ghosts, beyond a core's own cache
+    far_s: float  # additional time per row (vehicle or ghost) that exceeds a core's own cache
     memory_s: float  # additional time per row beyond all caches
     caches: Caches
     caller_s: float  # processor time of the caller per tick
@@ -92,7 +92,7 @@ class NodeCosts:
         return (self.ticks_per_step + 3.0 + offers) / self.ticks_per_step
 
     def work(self, vehicles: float, ghosts: float, busy: int) -> float:
-        """Return the processor time per tick of stepping vehicles; the cost of ghosts is extra.
+        """Return the processor time per tick of stepping vehicles, without `ghost_s` of ghosts.
 
         Rows that fit a cache are read from the cache, the other rows from memory. `busy`: number of
         working cores.

@@ -69,9 +69,9 @@ def measure(
         rows,
         notes=[
             "tick, wall: mean wall time of a tick; tick, processor: mean processor time of "
-            "the caller and all nodes together; tick, least: lower bound of the wall time, "
-            "measured in turn with the other times: as many processes exchange as many messages, "
-            "and each process runs the same world undivided; zones stand still: time from "
+            "the caller and all nodes together; tick, least: lower bound of the wall time: the "
+            "time of as many processes that exchange as many messages and each run the undivided "
+            "world, measured in turn with the other times; zones stand still: time from "
             "SIGKILL to the end of the caller's current or next step",
         ],
     )
@@ -97,7 +97,7 @@ class _Worlds:
         self.nodes.step(self._commands)
 
     def cpu_s(self) -> float:
-        """Return the processor time of caller and nodes since the last call."""
+        """Return processor time: the caller's since its start, the nodes' since the last call."""
         return time.process_time() + sum(load.cpu_s for load in self.nodes.node_loads())
 
 

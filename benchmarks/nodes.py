@@ -60,7 +60,7 @@ def measure(
     sides = [_Side(size, n, s) for size in sizes for s in (0.0, *added) for n in counts]
     sides += [
         _Side(size, 0, 0.0) for size in sizes
-    ]  # starts after the divided worlds, because these load the maps
+    ]  # undivided worlds start last, because the divided ones load the maps
     turns = _turns(sides, steps, repeats, realtime, say)
     samples = {side: _sample(side, turns[side]) for side in sorted(sides)}
     known = [s for s in samples.values() if s.nodes <= 2 and s.latency_s == 0.0]
@@ -159,7 +159,7 @@ def _row(
 
 
 def _predictions(costs: NodeCosts, cores: int) -> list[str]:
-    """Return the sizes from which dividing a city pays, by the model with a core for each node."""
+    """Return the model's times by size, with a core for each node, and whether dividing pays."""
     lines = []
     for vehicles in PREDICTED:
         found = {n: costs.tick(vehicles, n, 0.0, cores) for n in (0, *OVER)}

@@ -42,7 +42,7 @@ def measure(
     chosen = numbers_of("--seeds", seeds)
     unknown = sorted(set(kinds.split(",")) - set(FLOWS))
     if unknown:
-        raise ConfigError(f"--kinds: unknown {', '.join(unknown)}; must be of {', '.join(FLOWS)}")
+        raise ConfigError(f"--kinds: unknown {', '.join(unknown)}; known: {', '.join(FLOWS)}")
     rows: list[dict[str, Any]] = []
     with TemporaryDirectory() as name:
         for kind in kinds.split(","):

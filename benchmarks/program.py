@@ -1,6 +1,7 @@
 """Runs a benchmark as a program.
 
-A benchmark is a function that takes options and a `say`, and returns a `BenchmarkReport`.
+A benchmark is a function that takes options and `say`, a function that shows progress, and returns
+a `BenchmarkReport`.
 `cavmarl.bench.harness` also has helpers for turns, medians and checks of numbers.
 """
 

@@ -69,7 +69,7 @@ def measure(
         },
         rows,
         notes=[
-            f"imbalance (fullest zone / mean) of re-cut / static: {ratios.mean():.2f}{between}; "
+            f"imbalance (fullest zone / mean), re-cut / static: {ratios.mean():.2f}{between}; "
             "both worlds have the same states"
         ],
         facts={

@@ -113,7 +113,7 @@ def _evened(job: SensorJob, load_ms: float, say: Say) -> SensorJob:
     for grown in (False, True):  # the costs of low resolutions do not scale
         even = _scaled_by(even, factors)
         found_ms, costs_ms = _tried(even, load_ms, say)
-        if grown:  # other sensors take the rest
+        if grown:  # sensors that cannot grow take less than their share; others take the rest
             share_ms *= MARGIN * load_ms / found_ms
         for name, cost_ms in zip(factors, costs_ms, strict=True):
             factors[name] = share_ms / (cost_ms * (job.spec.agents or 1)) if cost_ms else 1.0

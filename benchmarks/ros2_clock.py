@@ -1,7 +1,8 @@
 """The clocks of a world and of a node of ROS 2 that drives in it, through the bridge.
 
-The node uses `rclpy` in a Python that `CAVMARL_RCLPY_PYTHON` names (`make ros2` makes two). In a
-share of the steps, the bridge can tick by itself, like the bridge of the co-simulation paper.
+The node uses `rclpy` in a Python that `CAVMARL_RCLPY_PYTHON` names (`make ros2` makes two, for
+Jazzy and Kilted). In a share of the steps, the bridge can tick by itself, like the bridge of paper
+B (`docs/explanation/papers.md`).
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ def measure(
     domain: Annotated[int, about("ROS_DOMAIN_ID.")] = 90,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Compare the clocks of a world and of a node of ROS 2, in lock step (Table II)."""
+    """Compare the clocks of a world and of a node of ROS 2, in lock step (Table II of paper B)."""
     say(f"{steps} steps")
     found, report = measure_ros_drift(
         world, steps=steps, rogue=rogue, own_ticks=own_ticks, domain=domain

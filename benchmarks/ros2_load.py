@@ -1,7 +1,8 @@
 """Clouds, pictures and inertial samples from a world to a node of ROS 2: how many are lost.
 
-The node uses `rclpy` in a Python that `CAVMARL_RCLPY_PYTHON` names (`make ros2` makes two). It has
-reliable subscriptions, and the profile of Fast DDS in `cavmarl/cosim/ros2/fast_dds.xml`.
+The node uses `rclpy` in a Python that `CAVMARL_RCLPY_PYTHON` names (`make ros2` makes two, for
+Jazzy and Kilted). It has reliable subscriptions, and the profile of Fast DDS in
+`cavmarl/cosim/ros2/fast_dds.xml`.
 """
 
 from __future__ import annotations

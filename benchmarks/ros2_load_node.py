@@ -1,8 +1,8 @@
-"""A node of ROS 2 that receives clouds, pictures and inertial samples, and counts gaps.
+"""A node of ROS 2 that receives clouds, pictures and inertial samples, and lists them.
 
     python ros2_load_node.py
 
-The program needs `rclpy` and nothing of cavmarl. When the last publisher of the clock is gone, it
+The program needs `rclpy` and nothing of cavmarl. When the last publisher of `IMU` is gone, it
 prints one line of JSON: for each topic, the stamps in ns and the number of bytes of its messages.
 """
 

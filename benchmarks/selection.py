@@ -1,4 +1,4 @@
-"""Sensitivity of the choice of a worker to the LoadScore's weights, and its time."""
+"""Choice of a worker: sensitivity to the LoadScore's weights, and time of a choice."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ from cavmarl.bench.harness import BenchmarkReport, Say, check_range, silent
 from cavmarl.cli.output import Seed, about
 from cavmarl.evaluate.statistics import share_interval
 
-# Weights besides the paper's: equal weights, other ratios, pairs, and single resources.
+# Weights besides those of paper A (docs/explanation/papers.md): equal weights, other ratios,
+# pairs, and single resources.
 OTHER_WEIGHTS = (
     (1 / 3, 1 / 3, 1 / 3),
     (0.5, 0.25, 0.25),
@@ -32,7 +33,7 @@ OTHER_WEIGHTS = (
     (0.0, 1.0, 0.0),
     (0.0, 0.0, 1.0),
 )
-FEW, MANY = 5, 100  # numbers of workers to choose from, and to time
+FEW, MANY = 5, 100  # workers per choice: to compare weights, and to time choices
 
 
 def measure(

@@ -45,7 +45,7 @@ def measure(
     at_least: Annotated[
         float | None,
         about(
-            "Exit with 1 if the second number of workers is not this many times faster.",
+            "Exit with 1 if the second of --workers is not this many times faster than the first.",
             callback=check_bound,
         ),
     ] = None,
@@ -115,12 +115,12 @@ def _sensors(found: SensorBench) -> Table:
         " / ".join(f"{1e3 * max(both[name].loads_s):.2f}" for name in ("in_turn", "cost"))
         for both in plans
     )
-    rows += [None, ("all; the slowest", "", "", "", "", f"{sum(found.costs_ms):.3f}", *slowest)]
+    rows += [None, ("sum; slowest worker", "", "", "", "", f"{sum(found.costs_ms):.3f}", *slowest)]
     return make_table(
         "the rig",
         (
             "sensor", "type", "sample", "Hz", "x, y, z m; yaw °", "ms",
-            *(f"in turn / by cost, {number}" for number in shared),
+            *(f"worker of {number}: in turn / by cost" for number in shared),
         ),
         rows,
     )  # fmt: skip
@@ -188,7 +188,7 @@ def _notes(found: SensorBench, rows: list[ScalingRow]) -> list[str]:
     ]
     lines = [
         f"the best number: [bold]{best.workers}[/] sensor workers, {best.speedup:.2f} "
-        f"times {rows[0].workers}; sensing takes {found.sensing_ms:.2f} ms per tick on "
+        f"times as fast as {rows[0].workers}; sensing takes {found.sensing_ms:.2f} ms per tick on "
         f"{rows[0].workers}",
         f"95 % between runs: {'; '.join(intervals) or f'none, needs {MIN_RUNS} runs'}",
         "states and frames of all runs, step by step: "
@@ -197,8 +197,8 @@ def _notes(found: SensorBench, rows: list[ScalingRow]) -> list[str]:
     if found.ceiling is not None:
         lines.append(
             f"{found.ceiling.programs} independent programs with the same work, side by side: "
-            f"[bold]{found.ceiling.ratio:.2f}[/] times one after the other; this is the machine's "
-            "limit"
+            f"[bold]{found.ceiling.ratio:.2f}[/] times as fast as one after the other; this is the "
+            "machine's limit"
         )
     cores = len(usable_cores())
     order = ", ".join(str(turn.workers) for turn in found.turns)

@@ -158,7 +158,7 @@ def _beats(store: Path, nodes: int, seconds: int) -> tuple[float, float]:
 async def _beat(
     url: str, granted: list[str], nodes: int, seconds: int, process: psutil.Process
 ) -> tuple[float, float]:
-    """Send heartbeats; each connection has the nodes of one identity. Return as `_beats`."""
+    """Send heartbeats; each connection has the nodes of one identity. Return what `_beats` does."""
     tokens = []
     async with httpx.AsyncClient(base_url=f"{url}/v1") as http:
         for secret in granted:

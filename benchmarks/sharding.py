@@ -3,7 +3,7 @@
 All zones run in this process on one core, so the whole work is visible. For each number of zones
 there are two worlds; one of them has a stopwatch on every phase. A turn is divided into parts. In
 each part, all worlds advance in a random order. Ratios are taken within a turn. So other load on
-the machine and data evicted from caches affect all worlds.
+the machine and data evicted from caches affect all worlds equally.
 """
 
 from __future__ import annotations

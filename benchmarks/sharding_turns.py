@@ -1,7 +1,7 @@
 """Turns of one world in zones, without a stopwatch and with a stopwatch on every phase.
 
 A turn is run in parts, interleaved with parts of other worlds, so that other load on the machine
-affects all worlds.
+affects all worlds equally.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ def _joined(parts: Sequence[Turn]) -> Turn:
 
 
 def _run(world: DrivenWorld, steps: int, watch: Stopwatch) -> Turn:
-    """Run and time steps of a world, without the decisions of agents and the counting."""
+    """Run steps of a world and time them; decisions of agents and counting are not timed."""
     simulation = world.simulation
     ns = vehicles = ghosts = largest = 0
     uneven = 0.0

@@ -48,7 +48,7 @@ def measure(
     spec = WorldSpec(env=env, agents=agents, seed=seed, overrides=parse_settings(settings))
     rows = []
     for number in numbers:
-        say(f"splitting one world of {'its' if number is None else number} vehicles")
+        say(f"splitting one world{'' if number is None else f' of {number} vehicles'}")
         others = background
         if number is not None:
             config, _ = load_config(env, **spec.keywords)

@@ -97,7 +97,7 @@ class TopicDriver:
         return is_new
 
     def _missing(self, now_ns: int) -> list[str]:
-        """Return the topics without a message of this time; the order of topics is not defined."""
+        """Return topics without a message of this time; messages of topics come in any order."""
         found = [topic for topic in KINDS if topic not in self._newest]
         for topic in (ODOMETRY, OBJECTS, LIGHTS):
             if topic in self._newest:
@@ -156,7 +156,7 @@ def _seen(one: Any) -> Seen:
 def main(
     folder: Path,
     domain: Annotated[int, typer.Option(help="ROS_DOMAIN_ID.")] = 0,
-    step_s: Annotated[float, typer.Option(help="Simulated seconds from clock to clock.")] = 0.1,
+    step_s: Annotated[float, typer.Option(help="Simulated seconds per clock message.")] = 0.1,
 ) -> None:
     """Drive with topics and the map in FOLDER."""
     driver = TopicDriver(folder, domain, step_s)

@@ -34,14 +34,15 @@ def measure(
         "traffic_worlds"
     ),
     without: Annotated[
-        list[str] | None, about("A feature to exclude from all worlds; repeatable.")
+        list[str] | None,
+        about("A feature (see world_draw.py) to exclude from all worlds; repeatable."),
     ] = None,
     maps: Annotated[
         Path | None, about("Folder of maps to cut [default: those in SUMO's wheel].")
     ] = None,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Draw worlds, run worlds without results, and show a summary and the worst worlds."""
+    """Draw worlds, run those that have no results yet, show a summary and the worst worlds."""
     make_folder(out)
     job = WorldSeries(out, worlds, first_seed, seconds, dt, tuple(without or ()), maps)
 
@@ -91,6 +92,7 @@ def _shares(found: Row) -> list[dict[str, str]]:
 def _caption(found: Row) -> str:
     contacts, queue = found.get("contacts", {}), found.get("queue", {})
     return (
+        "median size, 90 % below: of absolute deviations; "
         "near: within 15 % (speed), 5 % (arrived, departed), 25 % or 3 s (delay), or SUMO's "
         "spread; SUMO near: each of its seeds, compared with the others; contacts: "
         f"{contacts.get('ours')} in {contacts.get('worlds')} worlds "

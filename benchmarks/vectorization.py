@@ -63,7 +63,7 @@ def measure(
     steps: dict[str, Step] = {}
     missing: dict[str, str] = {}
     with ExitStack() as stack:
-        # Measure libraries that fork this process first, before it maps shared memory.
+        # Start libraries that fork this process first, before it maps shared memory.
         for library, make in (("supersuit", _supersuit), ("gymnasium", _gymnasium)):
             say(f"starting the workers of {library}")
             try:

@@ -48,7 +48,7 @@ def measure(
     vehicles: Annotated[int, about("Number of vehicles.")] = 10_000,
     clients: Annotated[int, about("Number of concurrent clients.")] = 100,
     rate_hz: Annotated[float, about("Frames per second.")] = 10.0,
-    moving: Annotated[int, about("Vehicles of the town stepped with and without watchers.")] = 1000,
+    moving: Annotated[int, about("Vehicles of `town`, run with and without watchers.")] = 1000,
     seconds: Annotated[float, about("Seconds of each measurement.")] = 10.0,
     seed: Seed = 0,
     say: Say = silent,
@@ -82,7 +82,7 @@ def measure(
         "core": "core:.0%",
         "frames/s": "fps:.1f",
         "calls": "calls",
-        "first, ms": "first:.0f",
+        "first picture, ms": "first:.0f",
         "times as long": "ratio:.3f",
     }
     return BenchmarkReport(f"{vehicles} vehicles on {env}", columns, rows)

@@ -30,14 +30,14 @@ def measure(
     ceiling = measure_ceiling(world, programs=count, **turns)
     low, middle, high, highest = found.barrier_us
     notes = [
-        f"{count} workers over one: [bold]{found.ratio:.2f}[/], by the busiest one's processor "
-        f"time {found.processor_ratio:.2f}; a step with one worker takes {found.cost_of_one:.2f} "
-        "times as long as without workers",
+        f"speedup of {count} workers over one: [bold]{found.ratio:.2f}[/], by the busiest one's "
+        f"processor time {found.processor_ratio:.2f}; a step with one worker takes "
+        f"{found.cost_of_one:.2f} times as long as without workers",
         f"an empty command to all {count}: [bold]{middle:.1f}[/] µs "
         f"({low:.1f} / {high:.1f} / {highest:.1f}: 5, 95, 99 %); idle workers take "
         f"{found.idle_s:.1%} of a core",
         f"{count} independent programs, side by side: [bold]{ceiling.ratio:.2f}[/] times "
-        "one after the other; this is the machine's limit",
+        "as fast as one after the other; this is the machine's limit",
     ]
     if found.is_crowded:
         notes.append("[yellow]note: more workers than cores[/]")

@@ -68,7 +68,7 @@ class NetDraw:
     kind: str  # one of `KINDS` or `NARROW`
     options: tuple[str, ...]  # options of netgenerate, or of netconvert for a cut or a zipper
     length_m: float  # length of a typical edge, or half the side of a cut
-    num_lanes: int  # upper bound on netgenerate's edges
+    num_lanes: int  # upper bound of lanes per edge, in netgenerate's nets
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def check_features(names: Collection[str]) -> None:
     unknown = sorted(set(names) - FEATURES)
     if unknown:
         known = ", ".join(sorted(FEATURES))
-        raise ConfigError(f"--without {unknown[0]}: unknown feature; must be of {known}")
+        raise ConfigError(f"--without {unknown[0]}: unknown feature; known: {known}")
 
 
 class _Chance:
@@ -169,7 +169,7 @@ class _Chance:
 def _narrow(seed: int, without: Collection[str]) -> str:
     """Draw a feature of `NARROW`, or "" for the other worlds.
 
-    Separate random numbers keep the other worlds of all seeds unchanged.
+    With separate random numbers, the other worlds are the same as they would be without `NARROW`.
     """
     place = float(np.random.default_rng([seed, 3]).random())
     for name, share in NARROW.items():

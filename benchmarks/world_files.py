@@ -100,7 +100,9 @@ def _cut(draw: WorldDraw, net: Path, maps: Sequence[Path]) -> None:
             continue  # no drivable road
         if int((~load_network(net).edges["internal"]).sum()) >= _LEAST_EDGES:
             return
-    raise MapError(f"{source}: {_CUTS} cuts of {2 * half:.0f} m have no roads; give larger maps")
+    raise MapError(
+        f"{source}: {_CUTS} cuts of {2 * half:.0f} m have too few roads; give larger maps"
+    )
 
 
 def _zippers(draw: WorldDraw, net: Path) -> None:

@@ -90,7 +90,7 @@ def sumo_beside_itself(row: Mapping[str, Any]) -> list[Row]:
 
 
 def badness(row: Mapping[str, Any]) -> float:
-    """Return the sort key of the worst worlds: failed, then contacts and locks, then mean speed."""
+    """Return the sort key of bad worlds: failed, contacts, locks, then speed and departures."""
     if "error" in row:
         return 1e6
     off = deviation(row, "mean_speed_mps")

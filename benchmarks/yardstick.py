@@ -1,11 +1,11 @@
-"""The built-in driver as agents, alone and in traffic, on any maps.
+"""The built-in driver in agents' seats, alone and in traffic, on any maps.
 
 Every trip counts, including trips that the end of the run truncates. A vehicle stands without a
 cause if it has stood for `STANDS_S` and none of these causes applies:
 
 - its signal is red;
 - another vehicle is close ahead, or just behind the junction;
-- another vehicle, or its rear, is on a path that crosses its own;
+- another vehicle, or only its rear, is on a path that crosses the path of this vehicle;
 - a vehicle with priority approaches, within its `registration_distance_m`.
 
 Contacts on lanes of different roads that overlap are counted separately (`shared_ground`).
@@ -152,7 +152,7 @@ def labels(maps: Sequence[str]) -> dict[str, str]:
 def _maps(
     named: Mapping[str, str], seeds: Sequence[int], folder: Path
 ) -> Iterator[tuple[str, Callable[[], str]]]:
-    """Yield for each map its label and a function that makes its worlds."""
+    """Yield for each map its label and a function that returns its name, or makes its file."""
     for name, label in named.items():
         yield label, lambda name=name: name  # type: ignore[misc]
     cuts = cut_maps(None) if seeds else ()
@@ -233,12 +233,12 @@ class SharedGround:
         return frozenset(shared_ground(self._network))
 
     def holds(self, row: np.void, rows: NDArray[np.void], dt: float) -> bool:
-        """Return whether the other vehicle of a contact is on a lane that overlaps.
+        """Return whether the other vehicle of a contact is on a lane that overlaps this one's.
 
-        The other vehicle has the nearest axis. `dt` is the upper bound of the time until they
-        touch, in s. If no vehicle is near, the other vehicle has just departed on the overlapping
-        lane, because departures on the same lane keep a distance. Inside a junction, a vehicle
-        counts as on the lanes before and after it.
+        The vehicle with the nearest axis is taken as the other one. `dt` is the upper bound of the
+        time until they touch, in s. If no vehicle is near, the other one must have just departed on
+        the overlapping lane, because departures on the same lane keep a distance. Inside a
+        junction, a vehicle counts as on the lanes before and after it.
         """
         others = rows[rows["id"] != row["id"]]
         own_x, own_y = _axes(rows[rows["id"] == row["id"]], dt)

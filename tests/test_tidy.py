@@ -72,8 +72,8 @@ PASSED_ON = {
 }
 
 # The commit that raises one of these bounds gives the reason.
-PACKAGE_LINES = 156_450
-REACHABLE_LINES = 93_100  # lines that `make_vec` and `parallel_env` can reach
+PACKAGE_LINES = 156_650
+REACHABLE_LINES = 93_200  # lines that `make_vec` and `parallel_env` can reach
 
 # Module names that occur more than once, outside of cli/ and config/.
 SHARED_MODULE_NAMES = {"observations.py"}  # named like sumo-rl's module

@@ -74,7 +74,7 @@ class Args:
     num_steps: Annotated[int, "steps per world and update"] = 128
     epochs: Annotated[int, "passes over the decisions of an update"] = 4
     minibatches: Annotated[int, "minibatches per pass"] = 8
-    keep: Annotated[float, "share of decisions to learn from, by largest advantage"] = 1.0
+    keep: Annotated[float, "share of decisions to learn from: largest |advantages|"] = 1.0
     learning_rate: Annotated[float, "initial learning rate of Adam"] = 1e-3
     anneal: Annotated[bool, "anneal the learning rate to 0"] = True
     gamma: Annotated[float, "discount per step"] = 0.99
@@ -86,10 +86,10 @@ class Args:
     imitation_weight: Annotated[float, "initial weight of the distance to that driver"] = 0.0
     imitation_share: Annotated[float, "share of the run in which this weight falls to 0"] = 0.1
     move_off_weight: Annotated[
-        float, "weight of moving off where the built-in driver would, with no signal in the way"
+        float, "weight of a loss for standing where the built-in driver would go; not at signals"
     ] = 0.0
     start: Annotated[str, "driver to start from: weights, architecture, sensors, actions"] = ""
-    end_at_red: Annotated[bool, "end returns at a red light, as at a crash"] = False
+    end_at_red: Annotated[bool, "end a return when a red light is run, as at a crash"] = False
     opponents: Annotated[str, "drivers of some seats, not learnt from; comma-separated"] = ""
     opponent_share: Annotated[float, "share of the seats of each opponent"] = 0.1
     average: Annotated[float, "share of the driver's averaged weights that an update keeps"] = 0.0
@@ -342,7 +342,7 @@ class Learner:
             order = chosen[torch.randperm(len(chosen), device=chosen.device)]
             for rows in order.tensor_split(args.minibatches):
                 self.optimizer.zero_grad()
-                count = rows.numel() if rows.numel() > 1 else 0  # one row has no deviation
+                count = rows.numel() if rows.numel() > 1 else 0  # one row has no std
                 if count:
                     found.append(
                         self._differentiate(batch, advantages, reluctant, rows, share, left)

@@ -42,7 +42,7 @@ class Args:
 
     program: ClassVar[str] = "ppo_gymnasium.py"
 
-    env: Annotated[str, "environment: the name of an entry"] = "merge"
+    env: Annotated[str, "environment: a name from `cavmarl list`"] = "merge"
     num_envs: Annotated[int, "number of rows: agents of all worlds"] = 512
     num_worlds: Annotated[int, "number of parallel worlds"] = 32
     seed: Annotated[int, "root of all random numbers"] = 0

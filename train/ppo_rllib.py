@@ -149,7 +149,7 @@ def make_algorithm(args: Args, network: NetworkConfig) -> PPO:
             grad_clip=0.5,
             grad_clip_by="global_norm",
             train_batch_size_per_learner=world_steps,
-            # RLlib counts minibatches in decisions, but refuses one above the batch in world steps.
+            # RLlib counts a minibatch in decisions, but refuses a number above that of world steps.
             minibatch_size=min(max(decisions // args.minibatches, 2), world_steps),
             num_epochs=args.epochs,
         )

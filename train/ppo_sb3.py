@@ -47,7 +47,7 @@ class Args:
     env: Annotated[str, "environment: a name, a folder or a map file"] = "merge"
     num_worlds: Annotated[int, "number of parallel worlds"] = 32
     seed: Annotated[int, "root of all random numbers"] = 0
-    total_agent_steps: Annotated[int, "decisions to learn from, with waiting seats"] = 4_000_000
+    total_agent_steps: Annotated[int, "steps to learn from, also of waiting seats"] = 4_000_000
     minutes: Annotated[float, "stop after this time; 0: no limit"] = 0.0
     num_steps: Annotated[int, "steps per world and update"] = 128
     epochs: Annotated[int, "passes over the decisions of an update"] = 4

@@ -150,7 +150,7 @@ def main(words: Sequence[str] | None = None) -> int:
     """Measure, or print the table; return 0: done, 2: an error, 130: interrupted."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--maps", type=Path, help="RESCO's folder of maps")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[*range(5)], help="of the training")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[*range(5)], help="training seeds")
     parser.add_argument("--out", type=Path, default=Path("runs/signal_control.json"))
     parser.add_argument("--runs", type=Path, default=Path("runs/signal_seeds"))
     parser.add_argument("--table", type=Path, metavar="FILE", help="print the table of this file")

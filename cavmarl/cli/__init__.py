@@ -239,8 +239,8 @@ def main(words: Sequence[str] | None = None) -> None:
     """Run a command.
 
     A CavmarlError is printed as one line, with exit code 2. For an exception in a user's code, the
-    frames of that code are shown. SIGTERM ends a command like an interrupt: it closes and removes
-    what it has created.
+    frames of that code are shown. On SIGTERM, as on an interrupt, a
+    command ends, and closes and removes what it has created.
     """
     try:
         with _ended_by_sigterm():

@@ -1,4 +1,4 @@
-"""`cavmarl board`: checks entries of drivers, and shows them on a page."""
+"""`cavmarl board`: checks entries (drivers with recorded results), and shows them on a page."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ from cavmarl.cli.output import (
 from cavmarl.core.progress import progress_bar
 
 app = typer.Typer(
-    cls=CliGroup, help="Check and show the entries of a board of drivers.", no_args_is_help=True
+    cls=CliGroup,
+    help="Check entries (drivers with recorded results), and show them on a page, the board.",
+    no_args_is_help=True,
 )
 
 

@@ -143,7 +143,7 @@ def _speed(seed: int) -> float:
         run = Path(folder, "measured")
         _train(["--runs", folder, "--name", run.name], MEASURED, seed, is_shown=False)
         with (run / "progress.csv").open(encoding="utf-8", newline="") as file:
-            _, *rows = csv.DictReader(file)  # the first update has warmed up
+            _, *rows = csv.DictReader(file)  # without the first update, which warms up
     return statistics.median(float(row["agent_steps_per_s"]) for row in rows)
 
 
@@ -234,8 +234,8 @@ def compared(found: EvaluationReport) -> str:
         if is_better
     ]  # fmt: skip
     return (
-        f"{text} Its successful trips take {delay:.1f} s longer than at the limits, the trips of "
-        f"{RULES} {rules_delay:.1f} s. The adapted driver is better in "
+        f"{text} Its successful trips take {delay:.1f} s longer than at the speed limits, the "
+        f"trips of {RULES} {rules_delay:.1f} s. The adapted driver is better in "
         f"{' and '.join(wins) if wins else 'neither'}; it collides in "
         f"{100.0 * (ours['collision'].mean or 0.0):.1f} % of its trips, {RULES} in "
         f"{100.0 * (others['collision'].mean or 0.0):.1f} %."

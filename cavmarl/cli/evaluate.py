@@ -274,8 +274,8 @@ def _transfer_rows(found: Sequence[TransferSummary | None]) -> Iterator[list[str
         return
     yield ["transfers, forced", *(f"{each.transfers}, {each.forced}" for each in summaries)]
     for title, spreads in (
-        ("p50, p95, max ticks", [each.latency_ticks for each in summaries]),
-        ("p50, p95, max ms", [each.latency_ms for each in summaries]),
+        ("transfer p50, p95, max, ticks", [each.latency_ticks for each in summaries]),
+        ("transfer p50, p95, max, ms", [each.latency_ms for each in summaries]),
     ):
         yield [title, *(", ".join(map(number, spread)) for spread in spreads)]
 
@@ -323,7 +323,7 @@ def _check_page(html: Path | None) -> None:
 
 def _caption(repeats: int) -> str:
     if repeats > 1:
-        return "mean of the runs, ± or [95 % interval between runs], (SD within a run)"
+        return "mean of the runs, 95 % interval between runs (± or two limits), (SD within a run)"
     return "shares [Wilson's 95 %], means (SD within the run); one run: no interval of means"
 
 

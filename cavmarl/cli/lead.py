@@ -118,8 +118,8 @@ def lead(
     deadline_s: Annotated[
         float | None,
         about(
-            "With --pace: count steps that end more than S seconds after they are due, by the "
-            "phase in which the deadline passes [default: real time of one step].",
+            "With --pace: count steps that end more than S seconds after they are due, separately "
+            "for each phase in which the deadline passes [default: real time of one step].",
             "--deadline",
             metavar="S",
         ),

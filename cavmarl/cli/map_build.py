@@ -203,7 +203,8 @@ def _print_heights(console: Console, heights: HeightReport) -> None:
     lines = [
         f"heights: {low:.1f} to {high:.1f} m of {', '.join(heights.models)} "
         f"(cells of {heights.cell_m:.1f} m) at {heights.places} places; "
-        f"{heights.filled_places} in voids, filled ({heights.void_cells} cells)",
+        f"{heights.void_cells} cells have no height, so {heights.filled_places} places are "
+        "interpolated",
         f"bridges and tunnels: {len(heights.raised_edges)} edges, {heights.crossings} crossings of "
         f"lanes, ramps at {heights.ramp_places} places",
         f"flattened: {heights.smoothed_places} places, by {heights.most_smoothed_m:.2f} m at most; "

@@ -116,7 +116,7 @@ def _print(console: Console, document: dict[str, Any]) -> None:
         ["lanes seen", f"{surface['seen_share']:.0%}"],
         ["road heights, RMSE, m", f"{surface['height_rmse_m']:.3f}"],
         ["walls, RMSE across, m", _shown(surface["wall_rmse_m"])],
-        ["RMSE to the surface, eq. (1) unaligned, m", f"{told['icp_rmse_m']:.3f}"],
+        ["RMSE to the surface without alignment, eq. (1), m", f"{told['icp_rmse_m']:.3f}"],
         ["mean distance, eq. (2), m", f"{told['mean_distance_m']:.3f}"],
     ]
     console.print(grid(["survey", ""], rows))

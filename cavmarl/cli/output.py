@@ -345,7 +345,7 @@ def check_extras(
     Args:
         world: the world to make, which may need SUMO.
         policies: drivers, which may need the library of a model file.
-        needed: values of options, with the modules and extras that they need if they are set.
+        needed: the value of an option, and the modules (with their extras) that it needs if set.
     """
     config, _ = load_config(world.env, **world.keywords)
     modules: dict[str, str] = {}

@@ -138,7 +138,8 @@ def _cut_anew(
     )
     if found is None:
         return (
-            f"no other zones are better balanced by more than the tolerance; {path} is not written"
+            f"new zones would not improve the balance by more than the tolerance; {path} is not "
+            "written"
         )
     write_zones(path, found.partition)
     return (

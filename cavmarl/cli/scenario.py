@@ -85,7 +85,11 @@ def run(
         ),
     ] = "grid4x4",
     place: Annotated[
-        str, about("Place on the map [default: drawn by the seed].", metavar="PLACE")
+        str,
+        about(
+            "Place on the map, as an earlier run prints it [default: drawn by the seed].",
+            metavar="PLACE",
+        ),
     ] = "",
     param: Annotated[
         list[str] | None,

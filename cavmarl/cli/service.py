@@ -202,7 +202,8 @@ def grant(
     """Create an identity and its secret, which is not shown again."""
     with connect(service, secret_file, authority, plain_http) as client:
         if out is not None:
-            _write_secret(out, "")  # before the identity exists: its secret is shown only once
+            # The secret is shown only once: if the file cannot be written, create no identity.
+            _write_secret(out, "")
         secret = client.post("/identities", {"name": name, "role": role})["secret"]
     if out is None:
         _print(secret)

@@ -49,8 +49,8 @@ def submit_train(
     to: Annotated[
         str,
         about(
-            "Where the job runs: slurm, ray, service for a node of a coordination service, or "
-            "local for this machine.",
+            "Where the job runs: slurm, ray, service (a node of a coordination service), or local "
+            "(this machine).",
             metavar="PLACE",
         ),
     ] = "slurm",
@@ -193,7 +193,7 @@ def _submit_to_service(client: Client, args: Any) -> str:
         option = "import" if key == "plugins" else key
         raise ConfigError(f"--{option}: has no effect with --to service; leave it out")
     settings = {key: chosen[key] for key in changed - OF_CONFIGURATION - OF_NODE}
-    settings["total_agent_steps"] = args.total_agent_steps  # the total of the progress
+    settings["total_agent_steps"] = args.total_agent_steps  # progress is shown up to it
     keys: dict[str, Any] = {"num_envs": args.num_envs, "seed": args.seed}
     keys["overrides"] = parse_settings(split_settings(args.settings))
     keys |= {key: chosen[key] for key in ("agents", "zones") if chosen[key]}

@@ -27,7 +27,7 @@ class ActionConfig(Section, key="action"):
         grid_throttle: `grid`: increasing throttles in [-1, 1], including 0.
         grid_steering: `grid`: increasing steerings in [-1, 1], including 0. With n steerings,
             choice k is throttle k // n and steering k % n.
-        out_of_range: continuous values beyond ±1: `error`, or `clip` (see `traffic_stats`).
+        out_of_range: continuous values beyond ±1: `error`, or `clip` (`traffic_stats` counts them).
         missing_action: live agents without an action: `error`, or `hold` the last one (counted).
         late_actions: if an agent that has left gets an action: `error`, or `ignore` (counted).
     """

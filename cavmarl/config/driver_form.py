@@ -185,7 +185,7 @@ def differing_keys(form: Form, config: EnvConfig) -> dict[str, tuple[Any, Any]]:
 
 
 def _values_at(overrides: Mapping[str, Any], key: str) -> Iterable[Any]:
-    """Yield each value that overrides set for a key, for a section around it, or inside it."""
+    """Yield each value that overrides set at a key, in a section around it, or at a part of it."""
     for name, value in overrides.items():
         if not isinstance(name, str):
             continue  # `load_config` raises an error for it

@@ -27,7 +27,7 @@ from cavmarl.config.workers import WorkersConfig
 from cavmarl.config.zones import ZonesConfig
 from cavmarl.core.scene_names import is_scene_file
 
-BY_MAP = 0.0  # horizon in s that is derived from the map
+BY_MAP = 0.0  # this value of `horizon_s` means: derived from the map
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,9 @@ class MapConfig(Section, key="map"):
         changed_lanes: number of lanes that may differ from the map in a world at the same time:
             closed (`close_road`), or with a lower speed limit (`damage_road`). If it is above 0,
             each world needs memory for its own tables of lanes and of routes from all lanes.
-        contraflow: ids of roads that can be reversed (`close_road`). The map gets lanes in the
-            opposite direction on them, which are closed until the road is reversed. For a reversed
-            road, the lanes of both directions count towards `map.changed_lanes`.
+        contraflow: ids of roads that `close_road(…, contraflow=True)` can reverse. The map gets
+            lanes in the opposite direction on them, which are closed until the road is reversed.
+            For a reversed road, the lanes of both directions count towards `map.changed_lanes`.
         events: roads that close, open, slow down or are reversed during each episode; see
             `config.road_events.RoadEvent`.
     """
@@ -69,7 +69,7 @@ class MapConfig(Section, key="map"):
             self.need(
                 "changed_lanes",
                 self.changed_lanes > 0 or not getattr(self, name),
-                f"map.{name} needs lanes that may change: set it to their number",
+                f"map.{name} changes lanes; set this key to the number of these lanes",
             )
         self.need("source", bool(self.source) and all(self.sources), "must name a map file")
         self.need("programs", all(self.programs), "must name files")
@@ -272,7 +272,7 @@ class EnvConfig(Section, key=""):
             )
 
     def _check_sumo(self) -> None:
-        """Raise an error for settings that SUMO as global traffic does not support."""
+        """Raise an error for settings that are impossible if SUMO provides the traffic."""
         source, tick_ms = self.traffic.source, self.clock.sim_dt_s * 1000.0
         self.need(
             "clock.sim_dt_s",
@@ -346,7 +346,7 @@ class EnvConfig(Section, key=""):
     def tells_sumo(self) -> bool:
         """Whether SUMO receives commands during an episode, so that it deviates from its demand.
 
-        SUMO receives changes of lanes and, if SUMO moves vehicles, also cavmarl's vehicles.
+        SUMO receives changed lanes and, with `sumo-traffic`, also the vehicles that cavmarl moves.
         """
         source = self.traffic.source
         return source == "sumo-traffic" or (source != "native" and self.may_change_lanes)

@@ -1,12 +1,12 @@
 """The keys `population.fleet` and `population.own_types`: the agents' types, drivers and sensors.
 
 population:
-agents: 6
-own_types:
-van: {like: truck, length_m: 6.4, width_m: 2.1, height_m: 2.7, wheelbase_m: 3.7}
-fleet:
-- {type: car, rig: [roof, gnss], driver: cities_ippo, share: 2}
-- {type: van, rig: [gnss]}
+  agents: 6
+  own_types:
+    van: {like: truck, length_m: 6.4, width_m: 2.1, height_m: 2.7, wheelbase_m: 3.7}
+  fleet:
+    - {type: car, rig: [roof, gnss], driver: cities_ippo, share: 2}
+    - {type: van, rig: [gnss]}
 """
 
 from __future__ import annotations

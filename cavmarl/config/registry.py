@@ -73,7 +73,7 @@ def programs() -> dict[str, Path]:
 
 
 def agent_here(name: str) -> Path | None:
-    """Return a path in the working directory that shadows the name of a driver of the package."""
+    """Return a driver of this name in the working directory that is not in `agent_entries`."""
     for path in (Path.cwd() / "agents" / f"{name}.py", Path.cwd() / "agents" / name):
         is_driver = isfile(path) if path.suffix == ".py" else _agent_name(path) is not None
         if is_driver and agent_entries().get(name) != path:
@@ -244,7 +244,10 @@ def load_plugins_of(env: str | Path, overrides: Mapping[str, object] | None = No
 
 
 def find_settings(what: str, name: str) -> Path:
-    """Return the path of a file, or of a `rig`, `suite` or `train` file of `configs/` by name."""
+    """Return the path `name` if it is a file, else the file with this name in `configs/`.
+
+    `what`: `rig`, `suite` or `train`.
+    """
     if Path(name).is_file():
         return Path(name)
     folder, usual = {
@@ -366,7 +369,7 @@ def resolve_programs(config: EnvConfig, base_dir: Path) -> list[Path]:
 
 
 def resolve_buildings(config: EnvConfig, base_dir: Path) -> Path | None:
-    """Return the file of `map.buildings`, None if empty; otherwise as `resolve_map`."""
+    """Return the file of `map.buildings`, or None if the key is empty; raises as `resolve_map`."""
     match config.map.buildings:
         case "":
             return None
@@ -377,7 +380,7 @@ def resolve_buildings(config: EnvConfig, base_dir: Path) -> Path | None:
 
 
 def resolve_zones(config: EnvConfig, base_dir: Path) -> Path | None:
-    """Return the zone file in `zones.layout`, None for a method; otherwise as `resolve_map`."""
+    """Return the zone file in `zones.layout`, or None for a division method; raises ConfigError."""
     layout = config.zones.layout
     if layout in ZONE_LAYOUTS:
         return None

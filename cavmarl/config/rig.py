@@ -21,7 +21,7 @@ from cavmarl.config.checks import Whole, Within, check, check_finite, check_rang
 
 MAX_SENSORS = 64
 MAX_RAYS = 8192  # per layer; finer than 0.05° for a full circle
-MAX_SAMPLE_NUMBERS = 1 << 22  # per sensor: an image of 1920 by 1080 pixels with two bytes each
+MAX_SAMPLE_NUMBERS = 1 << 22  # per sensor and step: two depth images of 1920 by 1080 pixels
 MAX_RATE_HZ = 10_000.0
 MAX_REACH_M = 300.0
 
@@ -170,7 +170,7 @@ def _other_rates(rate: Fraction, sim_dt_s: float, in_batches: bool) -> str:
 
 
 def _check_exact(key: str, config: SampledConfig) -> None:
-    """Raise an error if a sensor of classes has noise or bias, which labels cannot have."""
+    """Raise an error if a sensor that reports classes has noise or bias."""
     for name in ("noise", "bias"):
         values = getattr(config, name)
         check(not any(values), f"{key}.{name}", values, "must be 0: classes have no noise or bias")
@@ -184,7 +184,7 @@ class LidarRigConfig(SampledConfig):
         range_m: range of the sensor.
         rays: rays per layer, from right to left.
         layers: number of layers; 1: a planar lidar.
-        fov_deg: angle that the rays cover; 360: a full circle that starts forward.
+        fov_deg: angle that the rays cover; 360: a full circle whose first ray points forward.
         lower_deg: elevation of the lowest layer, if there are several.
         upper_deg: elevation of the highest layer.
     """

@@ -1,12 +1,12 @@
 """The key `map.events`: roads that close, open, slow down or change direction during an episode.
 
 map:
-source: grid4x4
-changed_lanes: 8
-events:
-- {at_s: 60, action: close, edges: [B1B2, B2B1]}
-- {at_s: 90, action: damage, edges: [A1B1], speed_mps: 3}
-- {at_s: 300, action: open, edges: [B1B2, B2B1]}
+  source: grid4x4
+  changed_lanes: 8
+  events:
+    - {at_s: 60, action: close, edges: [B1B2, B2B1]}
+    - {at_s: 90, action: damage, edges: [A1B1], speed_mps: 3}
+    - {at_s: 300, action: open, edges: [B1B2, B2B1]}
 """
 
 from __future__ import annotations

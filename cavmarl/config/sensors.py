@@ -365,8 +365,8 @@ class ConflictsConfig(
             also adds two features per vehicle: whether it is seen, and the age of the message.
         indicators: true assumes that seen vehicles follow their lanes and the direction that they
             indicate at their present or next junction. It also adds this turn as a feature.
-        indicators_m: distance to the junction from which vehicles indicate; before that, their turn
-            is unknown. 0: they indicate at any distance, as read from the world's state.
+        indicators_m: vehicles indicate within this distance of the junction; farther away, their
+            turn is unknown. 0: they indicate at any distance, as read from the world's state.
         horizon_s: time for which motion is predicted; a multiple of 0.5 s.
         departs: false assumes that the ego vehicle keeps its speed, but drives at least 3 m/s. True
             assumes that it accelerates with 2 m/s² to the speed limit of its lane.

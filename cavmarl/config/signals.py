@@ -59,9 +59,9 @@ class SignalsConfig(Section, key="signals"):
             begins the next one in the order of the program.
         forbidden: a choice that the action mask excludes is ignored and counted (`ignore`), or is
             an ActionError (`error`).
-        range_m: scores of controllers and rewards count the vehicles on lanes that lead to a signal
-            within this distance of its stop line; 0: only on the last lane before the signal, as in
-            sumo-rl. All vehicles on such a lane count, even beyond it. Needs `sensing: truth`.
+        range_m: how far before the stop line scores of controllers and rewards count vehicles. A
+            lane of which a part is within this distance counts completely. 0: only the last lane
+            before the signal counts, as in sumo-rl. Needs `sensing: truth`.
         terms: weights of the reward's terms; see `SIGNAL_TERMS`.
         sensing: what agents and controllers know of the vehicles: `truth`; the induction `loops` of
             the lanes; what the `camera` of a signal sees; or `v2x`, messages that its roadside unit

@@ -1,4 +1,4 @@
-"""`SumoConfig`: the keys under `sumo` of `env.yaml`, used if SUMO is global traffic."""
+"""`SumoConfig`: the keys under `sumo` of `env.yaml`, used if SUMO provides the traffic."""
 
 from __future__ import annotations
 

@@ -23,8 +23,8 @@ class WorkersConfig(Section, key="workers"):
         balance_steps: steps between two rounds in which worlds, or zones of a divided world, may
             move to another worker, based on their measured cost; 0: they never move. Results do
             not depend on it.
-        imbalance_tolerance: worlds or zones move only if the slowest worker takes longer than with
-            a perfect division of the work, by more than this share of that time.
+        imbalance_tolerance: worlds or zones move only if the time of the slowest worker exceeds the
+            time with evenly divided work by more than this share.
         max_moves: maximum number of worlds or zones that move in one round.
         monitor_cpu: measure the load of other programs on the workers' cores, and give no more work
             to workers above a threshold of `LoadScore` (docs/explanation/balance.md); if false,

@@ -114,7 +114,7 @@ class ExternalAgents:
             )
 
     def prepare(self) -> None:
-        """Store the poses before the first step of a copied environment."""
+        """Before the first step of a copied environment, store the poses; later, do nothing."""
         if self._sensing is None:
             self._sense_with(self._session.present()).rig.begin(self._scenes())
 

@@ -157,7 +157,7 @@ class ExternalCommands:
         if not free.any():
             raise CapacityError(
                 f"world {world}: all {self._most} places of population.external are in use; set "
-                "it higher, or remove a vehicle before the last step"
+                "it higher, or remove a vehicle and then call step"
             )
         slot = int(np.argmax(free))
         self._told[world, slot] = told

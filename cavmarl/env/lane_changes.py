@@ -173,7 +173,7 @@ class LaneChanges:
             self._queue(world, road)
 
     def _queue(self, world: int, edge: str) -> None:
-        """Keep a road open that is to be reversed, until the reversed roads before it are empty."""
+        """Let a road that is to be reversed stay open until reversed roads before it are empty."""
         limit_mps, classes = self._now(world)
         classes[self._rows(world, edge, None)] = 0
         closing = (CLOSED, edge)
@@ -265,8 +265,8 @@ class LaneChanges:
         Args:
             world: number of the world.
             edge: id of the road.
-            speed_mps: limit in m/s, above 0 and at most the map's limit. The map's own limit ends
-                an earlier change.
+            speed_mps: limit in m/s, above 0 and at most the map's limit, which ends an earlier
+                change.
             lanes: see `close`.
 
         Raises:

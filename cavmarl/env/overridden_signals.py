@@ -62,7 +62,7 @@ class SignalOverrides:
 
         Args:
             signal: id of the signal.
-            index: position in the letters of the signal's phases; applies to all of its links.
+            index: position in the letters of the signal's phases; all links there show the letter.
             letter: one of `rugGysoOY`, SUMO's letters.
             world: number of the world.
 

@@ -23,7 +23,7 @@ from cavmarl.v2x.kernels.v2x_records import REPORT
 SAMPLES = "samples-"  # prefix of the name of a sensor's table
 V2X, HANDOVERS = "v2x", "handovers"
 _WHOSE = [("tick", "<i8"), ("agent", "<i4"), ("vehicle", "<i8")]
-# One report of a packet; `sent` and `from_x`, `from_y` (m) belong to the packet.
+# One report of a packet; `tick`, `sender`, `kind`, `from_x` and `from_y` (m) belong to the packet.
 _V2X = np.dtype(
     [
         ("tick", "<i8"),
@@ -174,7 +174,7 @@ class RecordedExtras:
     def _observed(
         self, dtype: np.dtype[Any], frame: WorldFrame, actions: NDArray[Any] | None
     ) -> Rows:
-        """Return a row of each agent that acted in the step, or that acts next, by agent.
+        """Return rows of the agents that acted in the step, or that act next, by tick and agent.
 
         If the step has also reset the world, its results belong to the previous episode.
         """

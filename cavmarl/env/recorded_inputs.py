@@ -59,7 +59,7 @@ def inputs_row(
     rows["seed"] = "" if commands is not None or inputs.seed is None else str(inputs.seed)
     for name in command_names(dtype) if commands is not None else ():
         array = getattr(commands, name)
-        if array.size:  # without events, no events are passed
+        if array.size:  # empty if no events were declared
             rows[name] = array
     return rows
 

@@ -57,7 +57,7 @@ class WorldRecorder:
     Args:
         record: the new folder, or options with the optional tables.
         worlds: the worlds that are stepped.
-        simulation: the worlds or a local copy, for the reach of their zones.
+        simulation: the worlds or a local copy, which know the width of the halo.
         state_hash: returns the hash of a world, for the table `commands`; None: it is not
             available.
         more: additional entries of the manifest.

@@ -24,8 +24,8 @@ AS_ON_MAP, CLEARING, REVERSED_NOW, RETURNING, QUEUED = range(5)
 _STATE, _SINCE, _KEPT = range(3)
 _NOT_YET = -1  # the state begins in the next step
 
-# Minimum time between closing lanes and opening the lanes in the other direction. By then, vehicles
-# that could not stop before the closed lanes have entered them, so that the lanes are not empty.
+# Minimum time between closing lanes and opening the lanes in the other direction. Vehicles that
+# cannot stop before the closed lanes enter them within this time, so that they are seen there.
 CLEAR_S = 10.0
 
 
@@ -75,7 +75,7 @@ class ReversedRoads:
         self.states[world, self._roads.index(edge), _KEPT] |= bits
 
     def open_all(self, world: int, edge: str) -> None:
-        """Let all lanes of a road that returns open."""
+        """Undo `keep_closed`: all lanes of a road that returns open."""
         self.states[world, self._roads.index(edge), _KEPT] = 0
 
     def _kept(self, world: int, road: int) -> NDArray[np.bool_]:
@@ -188,7 +188,7 @@ def _ground(network: RoadNetwork, edge: int) -> NDArray[np.intp]:
 
 
 def _roads_before(network: RoadNetwork, edges: Sequence[int]) -> NDArray[np.bool_]:
-    """Return (C, C), true where the second road leads to the first, which does not lead back.
+    """Return (C, C): [a, b] is true if road b leads to road a, which does not lead back to b.
 
     On a cycle of roads, no road waits for another.
     """

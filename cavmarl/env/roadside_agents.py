@@ -179,8 +179,8 @@ class RoadsideAgents(ABC):
         """Return the info of each agent of the first world.
 
         `decides`: whether its next action counts. `action_mask`: allowed choices, int8. `refused`:
-        number of choices in the episode that were not allowed. The index of the present choice
-        has the key in the attribute `choice`; each term of the reward has its own key.
+        number of choices in the episode that were not allowed. The attribute `choice` is the
+        key of the index of the present choice; each term of the reward has its own key.
         """
         arrays = self._arrays
         decides = int(arrays.signal_decides[0])

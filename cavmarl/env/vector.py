@@ -259,7 +259,7 @@ class CavVectorEnv(WorldsEnvironment):
             truncations (W, A): the horizon of the episode or of the trip was reached; and infos:
             `mask` (W, A) agents that act next; `acted` (W, A) agents that acted in this step, so
             their rewards count; `vehicle_done` (W, A) agents whose vehicle's trip ended for any
-            reason; `terms` (W, A, T) in the order of `config.terms.TERMS`; `arrivals` (W,) vehicles
+            reason; `terms` (W, A, T) in the order of `TermsConfig.names`; `arrivals` (W,) vehicles
             that reached their goal since the reset, agents included; `episode_over` (W,) worlds
             whose episode is over;
             `final_observations` (W, A, D) observations before a reset, including the last ones of
@@ -326,7 +326,7 @@ class CavVectorEnv(WorldsEnvironment):
         if kind not in actions or (VEHICLES not in actions and self.config.population.agents):
             raise ActionError(f"actions lack {kind if VEHICLES in actions else VEHICLES}")
         choices = roadside.from_array(actions[kind])
-        idle = np.zeros_like(self.worlds.arrays.suggested)  # no agents drive vehicles
+        idle = np.zeros_like(self.worlds.arrays.suggested)  # if no agents drive vehicles
         return actions.get(VEHICLES, self._session.decoder.encode(idle)), choices
 
     def _observations(self) -> Observations:

@@ -83,7 +83,7 @@ def start_worlds(
         given: see `WorldArguments`.
 
     Raises:
-        UnknownArgumentError: an argument has another name.
+        UnknownArgumentError: `WorldArguments` has no argument of that name.
         ConfigError, PolicyError, MapError, WorkerError, MissingExtraError: see `make_vec`.
     """
     if refusal := next(filter(None, map(removed_argument, given)), None):

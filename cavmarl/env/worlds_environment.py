@@ -189,7 +189,7 @@ class WorldsEnvironment(OwnWorlds):
 
         Raises:
             ActionError: there is no such world, road or lane; the road is the last way out; or
-                `contraflow` is set without all lanes of a road of `map.contraflow`.
+                `contraflow` is set, but the road is not in `map.contraflow`, or lanes are left out.
             CapacityError: more than `map.changed_lanes` lanes would differ from the map.
             ConfigError: `map.changed_lanes` is 0.
         """
@@ -225,8 +225,8 @@ class WorldsEnvironment(OwnWorlds):
 
         Args:
             edge: id of a road.
-            speed_mps: the limit in m/s, above 0 and at most the map's limit; the map's own limit
-                ends an earlier change.
+            speed_mps: the limit in m/s, above 0 and at most the map's limit, which ends an earlier
+                change.
             lanes: indices of its lanes, from the kerb; None: all of them.
             world: number of the world.
 

@@ -74,11 +74,11 @@ class BoardEntry:
         about: first sentence of the card.
         kind: `trained`, `scripted`, or `model` (a model of another library); empty if unknown.
         environment: environment with its version; empty if the result cannot be read.
-        conditions: settings that differ from the environment's, for example other agents.
+        conditions: settings that differ from the environment's, for example the number of agents.
         episodes: number of episodes of all runs.
         trips: number of counted trips.
         shares: shares of trips, by the names of `SHARES`.
-        digest: SHA-256 of the driver's first file.
+        digest: SHA-256 of the driver's weights, script or model file.
         version: version of cavmarl that made the result.
         failure: why the entry failed, with the remedy; empty if it did not fail.
     """
@@ -126,13 +126,13 @@ def check_entry(folder: Path, progress: Progress | None = None) -> Verification:
     """Check that an entry is complete, and that repeating the evaluation gives the same bytes.
 
     The driver's script, if there is one, is run. A model file of another library is neither read
-    nor run: the files of the verification are then empty.
+    nor run: the result then has no hashes and no processors.
 
     Raises:
         ConfigError: there is no such folder, or no card.
         PolicyError: there is no driver, or it cannot be read.
-        ManifestError: a manifest is missing, of another version or of other files, a file was
-            changed, or the repeated evaluation gave other bytes.
+        ManifestError: a manifest is missing, was written by another version, or describes other
+            files; a file was changed; or the repeated evaluation gave other bytes.
     """
     if not folder.is_dir():
         raise ConfigError(f"{folder}: is not a folder; give the folder of an entry")
@@ -294,7 +294,7 @@ def _described(folder: Path, failure: str) -> BoardEntry:
 
 
 def _conditions(spec: WorldSpec, trained: Path | None) -> str:
-    """Return the settings that are neither the environment's nor a trained driver's sensors."""
+    """Return settings that replace the environment's, except a driver's own sensors and actions."""
     own = {} if trained is None else form_of_driver(trained)
     given = {name: getattr(spec, name) for name in _CONDITIONS}
     told = [f"{name} {value}" for name, value in given.items() if value is not None]

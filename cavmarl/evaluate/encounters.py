@@ -16,10 +16,10 @@ from cavmarl.roads.network import RoadNetwork
 
 
 def mirrored_conflicts(network: RoadNetwork) -> NDArray[np.int32]:
-    """Return (num_conflicts,) the CONFLICT row of the same area on the foe's path; -1: paths merge.
+    """Return for each conflict (num_conflicts,) the row of the same area on the foe's path.
 
-    After a merge both vehicles share a lane. This is car following, which time to collision
-    measures, not an encroachment.
+    -1: the foe has no such row, or the paths merge. After a merge, both vehicles share a lane.
+    This is car following, which time to collision measures, not an encroachment.
     """
     links, conflicts = network.links, network.conflicts
     link = np.repeat(np.arange(len(links)), links["num_conflicts"])
@@ -115,7 +115,7 @@ class BackgroundUse:
         self._km = np.zeros(vec.num_envs)
 
     def add(self, simulation: Simulation, step: int, running: NDArray[np.bool_]) -> None:
-        """Sample the running worlds (W,) before a step with this number."""
+        """Sample the running worlds (W,) before the step with the number `step`."""
         if step % self._every:
             return
         for world in np.flatnonzero(running).tolist():

@@ -1,4 +1,4 @@
-"""The episodes of one run: worlds are stepped together, in parts."""
+"""The episodes of one run, in parts: the worlds of one part are stepped together."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Speed:
 
     step_ms: float  # milliseconds of simulation for one step of one world
     policy_ms: float  # milliseconds of the policy for one step of one world
-    agent_steps_per_s: float  # decisions a second, simulation and policy
+    agent_steps_per_s: float  # decisions per second that simulation and policy take together
     worlds: int  # number of worlds stepped together
     # processor time of the slowest zone over the mean of all zones, summed over all worlds;
     # None: not measured

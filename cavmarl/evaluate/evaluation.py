@@ -118,8 +118,8 @@ def evaluate(
         episodes: number of episodes of each run.
         repeats: number of independent runs.
         out: folder for manifest and raw results; None: only the report is returned.
-        record: a new folder for recordings, or `RecordOptions`; worlds of a recording are episodes;
-            with several policies or runs, recordings are in subfolders POLICY/run-N
+        record: a new folder for recordings, or `RecordOptions`; each world of a recording is one
+            episode; with several policies or runs, recordings are in subfolders POLICY/run-N
             (docs/guides/recordings.md).
         failures: number of failed trips on the page `failures.html` in `out`; 0: no page.
         zones: sets zones.count, as in `make_vec`.
@@ -136,7 +136,7 @@ def evaluate(
 
     Raises:
         ConfigError: a wrong number or key, an override that contradicts a trained driver, `out`
-            cannot be created, or the state of such worlds cannot be copied from the backend.
+            cannot be created, or the backend has worlds whose state cannot be copied.
         PolicyError: a policy cannot be loaded or does not fit, two have the same name, or two
             trained drivers need different sensors.
         ManifestError: `out` already holds results.
@@ -193,7 +193,8 @@ def load_report(folder: Path) -> EvaluationReport:
     """Return the report of a results folder, recomputed from its raw tables.
 
     Raises:
-        ManifestError: the manifest is missing or open, or a result is not listed in it.
+        ManifestError: the manifest is missing or open (the evaluation has not ended), or a result
+            is not listed in it.
     """
     manifest = read_evaluation(folder)
     speeds = json.loads((folder / SPEED_FILE).read_text(encoding="utf-8"))
@@ -347,7 +348,7 @@ def _prepare(folder: Path, job: EpisodeJob, repeats: int) -> tuple[list[EpisodeJ
 
 
 def _runs(job: EpisodeJob, seeds: list[int], journal: str, worlds: int) -> list[EpisodeJob]:
-    """Return the runs of a job; each has its own journals: `run.jsonl`, `run.run-1.jsonl`."""
+    """Return the runs of a job, each with its own journals (`run.jsonl`, `run.run-1.jsonl`, …)."""
     jobs = []
     for run, seed in enumerate(seeds):
         overrides = dict(job.overrides)

@@ -16,7 +16,7 @@ from cavmarl.engine.world_frame import WorldFrame
 from cavmarl.sensors.sensed_shapes import Shape, observed_shapes
 
 CLIP_S = 10.0
-REACH_M = 70.0  # radius around the end of the trip that a clip shows
+REACH_M = 70.0  # greatest distance in x and in y from the end of the trip that a clip shows
 MOST_KEPT_BYTES = 256 << 20  # limit of memory for observations
 NO_SENSORS = "observes nothing that can be drawn"
 TOO_MANY = f"observations of ten seconds are more than {MOST_KEPT_BYTES >> 20} MB and were not kept"
@@ -76,7 +76,7 @@ class FailureClips:
             kept.append((frame, self._observations[frame.world].copy() if self._keeps else None))
 
     def take(self, trips: NDArray[np.void], first: int) -> None:
-        """Keep failed trips that ended in the step after the last frames.
+        """Keep the failed trips among `trips`, which ended in the step after the last frames.
 
         Args:
             trips: TRIP (n,); `episode` is their world.

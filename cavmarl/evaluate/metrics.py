@@ -55,8 +55,9 @@ METRICS = (
     Metric("episode_return", "return", "", "episode",
            "sum of rewards of an agent id over an episode, mean over the ids", "more"),
     _share("success", "success",
-           "trips that arrived within three times the free time, without a red light and never the "
-           "wrong way", "more"),
+           "trips that arrived in time (within their own horizon or, without one, within three "
+           "times the free travel time) and never passed a red light or drove against a lane",
+           "more"),
     _share("arrived", "arrived", "trips that arrived", "more"),
     _share("collision", "collision", "trips that ended by touching a vehicle", "less"),
     _share("off_road", "off road", "trips that ended off the road", "less"),
@@ -135,7 +136,7 @@ def metric_values(
 
 
 def _of_run(metric: Metric, trips: NDArray[np.void]) -> NDArray[np.float64]:
-    """Return one value (1,); it is missing (0,) without trips or, per km, without kilometres."""
+    """Return one value (1,), or none (0,) without trips; a value per km also needs kilometres."""
     km = np.maximum(trips["distance_m"], 0.0).sum(keepdims=True) / 1000.0
     if metric.name == KM_PER_INFRACTION:
         infractions = sum(int(trips[name].sum()) for name in INFRACTIONS)

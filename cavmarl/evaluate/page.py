@@ -105,7 +105,7 @@ def _content(folder: Path, report: EvaluationReport) -> dict[str, Any]:
 
 
 def _rows(report: EvaluationReport, *, rewards: bool) -> list[dict[str, Any]]:
-    """Return the metrics with a value for any policy; terms of the return must not all be 0."""
+    """Return rows of the metrics that have a value; terms of the return need one other than 0."""
     rows = []
     for metric in METRICS:
         found = [policy[metric.name] for policy in report.policies.values()]
@@ -228,7 +228,8 @@ FIGURES = (
             lambda found: found.forced),
     _Figure("failure rate", "%", "share of forced changes",
             lambda found: None if found.failure_rate is None else 100.0 * found.failure_rate),
-    _Figure("deferred", "ticks", "how long a vehicle beyond the border stayed with its owner",
+    _Figure("deferred", "ticks",
+            "how long vehicles beyond the border stayed with their owners, summed",
             lambda found: found.deferred),
     _Figure("refused", "", "states that a zone has refused", lambda found: found.refused),
     _Figure("withdrawn", "", "approaches that ended without a change",
@@ -239,13 +240,15 @@ FIGURES = (
             lambda found: found.timeouts["acknowledge"]),
     _Figure("timeouts, switch", "", "cases in which no answer came by the deadline",
             lambda found: found.timeouts["switch"]),
-    _Figure("timeouts, replica", "", "states that were neither requested nor withdrawn",
+    _Figure("timeouts, replica", "",
+            "states that were neither used nor withdrawn in their lifetime",
             lambda found: found.timeouts["replica"]),
     _Figure("latency", "ticks", "time from the first state at the new owner to its confirmation",
             lambda found: found.latency_ticks),
-    _Figure("latency behind the border", "ticks", "how long the old owner moved the vehicle",
+    _Figure("latency behind the border", "ticks", "the part of this time after the crossing",
             lambda found: found.waited_ticks),
-    _Figure("latency", "ms", "the same in wall time; not repeatable",
+    _Figure("latency", "ms",
+            "wall time from the first state to the confirmation; not repeatable",
             lambda found: found.latency_ms),
     _Figure("state", "bytes", "size of the state of a vehicle", lambda found: found.state_bytes),
     _Figure("depth at PREPARE", "m",

@@ -40,7 +40,7 @@ SHOWN = (
 DISTRIBUTIONS = ("delay_s", "least_ttc_s", "least_pet_s", "mean_speed_mps")
 COLUMNS = 4
 WIDTH_IN = 11.0
-MAX_JUMP_M = 40.0  # longest distance in a track; a longer one means a new vehicle of the same agent
+MAX_JUMP_M = 40.0  # longest gap between points of a track; a longer one: the agent's next vehicle
 MAX_RATIO = 5.0  # largest aspect ratio of a map's picture
 
 STYLE: dict[Any, Any] = {
@@ -224,7 +224,7 @@ def plot_learning(rows: Sequence[Mapping[str, str]]) -> str:
 
 
 def plot_series(series: Mapping[str, Sequence[float]], shown: Sequence[str], label: str) -> str:
-    """Plot columns of a table of times, `time_s`, in one figure."""
+    """Plot the columns `shown` of a table over its column `time_s`, in one figure."""
     with mpl.rc_context(STYLE):
         figure, axes = _figure(2.8)
         for place, name in enumerate(shown):
@@ -268,5 +268,5 @@ def _svg(figure: Figure) -> str:
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None}, transparent=True)
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
-    # Figures share names of groups; names that are referenced are hashes.
+    # All figures have the same ids of groups, so remove them. Ids that are referenced are hashes.
     return re.sub(r' id="[A-Za-z0-9.]+_\d+"', "", text)

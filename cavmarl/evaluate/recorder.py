@@ -15,7 +15,7 @@ PET_HORIZON_S = 10.0  # a pass after a longer time is no encounter
 SLOWEST = 3.0  # longest duration of a success, as a multiple of the free travel time
 STILL_S = 10.0  # a vehicle that has been stopped this long when its trip is cut counts as stopped
 MIN_DISTANCE_M = 1.0  # shortest trip whose delay per kilometre is compared
-JERK_UNIT_MPS3 = 10.0  # unit of the term `comfort`
+JERK_UNIT_MPS3 = 10.0  # unit of the term `jerk`
 BACKGROUND_COLUMNS = ("background_energy_wh_per_km", "background_co2_g_per_km")
 MESSAGE_COLUMNS = ("v2x_reception_ratio", "v2x_latency_s", "v2x_busy_ratio")
 
@@ -108,7 +108,7 @@ class Recorder:
         return rows
 
     def _close(self, ended: NDArray[np.bool_]) -> NDArray[np.void]:
-        """Return TRIP records of ended trips, and free their slots."""
+        """Return TRIP records of ended trips, and reset the sums of their agents."""
         world, agent = np.nonzero(ended)
         sums, steps = self._sums[ended], self._steps[ended]
         began = self._began[ended]

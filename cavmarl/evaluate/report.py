@@ -1,8 +1,8 @@
 """`EvaluationReport`: the results of an evaluation as frozen values.
 
 Two kinds of spread are kept apart. *Between runs*: each run has its own seed and gives one mean;
-the interval contains the mean of all such runs. *Within a run*: the spread of trips or episodes of
-one run says nothing about another run.
+the 95 % interval is for the mean over all possible seeds. *Within a run*: the spread of trips or
+episodes of one run says nothing about another run.
 """
 
 from __future__ import annotations

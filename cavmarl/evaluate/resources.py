@@ -118,7 +118,7 @@ def summary_of(rows: NDArray[np.void]) -> list[dict[str, Any]]:
 
     Keys: `process` (a number, or `caller`), `windows`, `cpu_share` and `wait_share` (of the wall
     time), `memory_mb` (the maximum), `bytes_per_tick`, `frames_per_tick`, `vehicles` and `ghosts`
-    (means), `straggler_share` (of the windows in which the other nodes waited for this one),
+    (means), `straggler_share` (share of windows in which the other nodes waited for this one),
     `migrations` (changes of owner in all worlds, counted by the caller). None: not measured.
     """
     found = []

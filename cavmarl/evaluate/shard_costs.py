@@ -1,4 +1,4 @@
-"""Measured costs of the shards of worlds, from a clock on every zone's phases."""
+"""Measured costs of shards: the processor time of each zone per tick."""
 
 from __future__ import annotations
 
@@ -50,7 +50,10 @@ def measure_rounds(
     before: int,
     stepped: Callable[[], None] = lambda: None,
 ) -> Iterator[MeasuredRound]:
-    """Drive one world from its reset and measure its zones; `stepped` is called per step."""
+    """Drive one world from its reset: `before` unmeasured steps, then `rounds` rounds of `steps`.
+
+    `stepped` is called after each step.
+    """
     for name, value in (("rounds", rounds), ("steps", steps), ("before", before)):
         if value < 1:
             raise ConfigError(f"{name} = {value}: must be at least 1")
@@ -85,8 +88,9 @@ def measure_shards(
 ) -> MeasuredWorlds:
     """Return the costs of all zones of the first `worlds` worlds of a seed.
 
-    The cost of a zone is the median of `PARTS` parts of the steps, so one-time work such as loading
-    a kernel does not count. `told` is called with the steps done and the total.
+    Each world takes `before` unmeasured steps, then `steps` measured ones. The cost of a zone is
+    the median of `PARTS` parts of these, so one-time work such as loading a kernel does not count.
+    `told` is called with the steps done and the total.
     """
     if steps < PARTS:
         raise ConfigError(f"steps = {steps}: must be at least {PARTS}")

@@ -18,7 +18,7 @@ from cavmarl.maps.netconvert import map_file
 from cavmarl.parallel.placement.backend_name import LOCAL
 from cavmarl.traffic.sumo.sumo_input import read_input
 
-SUMO = "SUMO"  # name of SUMO's row, with the map's own programs
+SUMO = "SUMO"  # name of the row of results from SUMO itself, with the map's own signal programs
 
 
 @dataclass(frozen=True)

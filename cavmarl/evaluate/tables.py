@@ -42,7 +42,7 @@ TRIP = np.dtype(
         ("stood", np.bool_),  # unfinished: stopped where the built-in driver would drive on
         ("out_of_time", np.bool_),  # unfinished: was moving
         # arrived in time, never entered a junction at red, never drove the wrong way. In time:
-        # within the trip's horizon, or within SLOWEST times the free time if it has none
+        # within the trip's horizon, or if it has none, SLOWEST times the free travel time
         ("success", np.bool_),
         ("red_light", np.bool_),  # whether it ever entered a junction at red
         ("wrong_way", np.bool_),  # whether it ever drove against its lane

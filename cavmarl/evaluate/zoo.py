@@ -206,7 +206,8 @@ def cross(
     return Cross(tuple(policies), tables)
 
 
-# Manifest keys of the map's source. If a new version reads the map differently, the trips differ.
+# Manifest keys that must be equal, besides the configuration. The map is compared by its source
+# only: if this version reads it differently, the trips will show it.
 _WORLD_KEYS = ("environment", "map_source_sha256", "demand_content_sha256")
 _KEYS = ("agents", "background", "max_cycles", "seed", "overrides")
 
@@ -317,9 +318,9 @@ def _check_world(document: Mapping[str, Any], name: str, spec: WorldSpec) -> Non
         ) from error
     if others:
         raise ManifestError(
-            f"{name}: its result is of {there['environment']}, but {others[0]} is another in this "
-            f"version ({here['environment']}); figures of different worlds are not compared: "
-            "evaluate the driver again"
+            f"{name}: its result is of {there['environment']}, but {others[0]} has another value "
+            f"in this version ({here['environment']}); figures of different worlds are not "
+            "compared: evaluate the driver again"
         )
 
 

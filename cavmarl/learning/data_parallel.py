@@ -25,8 +25,8 @@ T = TypeVar("T")
 class Ranks:
     """The processes of a training that `torchrun` has started, or this process alone.
 
-    All processes must call the same methods in the same order. If this process is alone, each
-    method returns its argument, unchanged.
+    All processes must call the same methods in the same order. If this process is alone, the
+    methods exchange nothing.
 
     Args:
         size: number of processes.

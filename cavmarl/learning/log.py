@@ -48,7 +48,7 @@ def curve_row(
 
 
 class Trips:
-    """Returns and ends of the last `WINDOW` trips, and the current trips of (W, A) agents."""
+    """The returns and ends of the last `WINDOW` trips, and current trips of (W, A) agents."""
 
     def __init__(self, num_envs: int, num_agents: int) -> None:
         self._sums = np.zeros((num_envs, num_agents, 2))  # return, red lights run
@@ -139,7 +139,7 @@ class Log:
         return sizes
 
     def close(self) -> None:
-        """Close the files and ignore errors; after a full disk, failed writes are not repeated."""
+        """Close the files and ignore errors; rows that a full disk has refused are lost."""
         with suppress(OSError):
             self._file.close()
         for logger in self._loggers:

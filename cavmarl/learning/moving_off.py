@@ -27,7 +27,11 @@ class MovingOff:
     """
 
     def __init__(self, sensors: SensorsConfig, action: ActionConfig) -> None:
-        """Find the features. Raises ConfigError: no `ego` sensor, stacked or discrete actions."""
+        """Find the features.
+
+        Raises:
+            ConfigError: there is no `ego` sensor, frames are stacked, or actions are discrete.
+        """
         names = feature_names(sensors)
         if ("ego", "speed") not in names or sensors.stack > 1 or action.kind != "continuous":
             raise ConfigError(
@@ -49,15 +53,16 @@ class MovingOff:
 
 
 def move_off_loss(output: Tensor, reluctant: Tensor) -> Tensor:
-    """Return the mean over N of the squared lack of throttle of the vehicles in `reluctant` (N,).
+    """Return the mean of the squared lack of throttle; it is 0 for vehicles not in `reluctant`.
 
-    `output` (N, 2): means of the actions.
+    The mean is over all N vehicles. `output` (N, 2): means of the actions. `reluctant` (N,): which
+    vehicles should move off.
     """
     lack: Tensor = (THROTTLE - output[:, 0]).relu().square() * reluctant
     return lack.mean()
 
 
 def is_held_back(output: Tensor) -> Tensor:
-    """Return which (N,) vehicles would get less throttle than they are pulled to."""
+    """Return which (N,) vehicles would get less throttle than `THROTTLE`."""
     held: Tensor = output[:, 0] < THROTTLE
     return held

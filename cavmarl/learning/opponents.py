@@ -17,7 +17,9 @@ Mask = NDArray[np.bool_]
 
 
 class Opponents:
-    """Fixed drivers, each for about `share` of the agents, drawn at random; drivers to imitate.
+    """Fixed drivers, each for about `share` of the agents, which are drawn at random.
+
+    The object also loads drivers to imitate, see `example`.
 
     Attributes:
         absent: (W, A) agents of the learning driver, which have no opponent.

@@ -1,4 +1,4 @@
-"""Training jobs of a Ray cluster: a job of Ray, whose program trains in a task.
+"""Training jobs on a Ray cluster: the program of each job trains in a task of Ray.
 
 Ray starts the task again on another machine if its machine fails, and the run continues from its
 last checkpoint.

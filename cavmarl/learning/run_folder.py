@@ -207,8 +207,8 @@ class RunFolder:
     def save(self, agent_steps: int, updates: int, parts: Parts) -> None:
         """Replace the checkpoint by a new one; all processes call this.
 
-        When a process other than the first resumes, it gets the parts of the first process, except
-        for parts whose name is also in its own `parts`: these are its own.
+        When a process other than the first resumes, it gets the parts of the first process, but its
+        own parts replace those with the same name.
 
         Raises:
             TrainingError: it cannot be written; the previous one is intact.

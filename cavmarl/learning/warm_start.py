@@ -1,4 +1,4 @@
-"""`begin_with`: start a run with a driver's weights if the run has the driver's observations."""
+"""`begin_with`: start a run with a driver's weights, also if their observations differ."""
 
 from __future__ import annotations
 

@@ -45,9 +45,10 @@ class LimitController(Protocol):
 
 
 class Feedback:
-    """Sets the lowest limit if the density is above the target; otherwise, raises it by one step.
+    """Sets the lowest allowed limit if the density of the watched section is above the target.
 
-    A low limit before a queue reduces the inflow for a while, so that the queue dissolves.
+    Otherwise, it raises the limit to the next entry of `limits.speeds_mps`. A low limit before a
+    queue reduces the inflow for a while, so that the queue dissolves.
 
     Source of the principle: Hegyi, Hoogendoorn, Schreuder, Stoelhorst, Viti, "SPECIALIST: A dynamic
     speed limit control algorithm based on shock wave theory", IEEE ITSC 2008. The rule is our own.

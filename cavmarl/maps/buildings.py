@@ -36,7 +36,7 @@ PASSABLE_M = 3.0  # vehicles and rays pass under a building that begins at this 
 _NO_WALLS = frozenset(("no", "roof", "carport", "canopy", "demolished", "ruins"))
 _METRES = re.compile(r"\s*(-?[0-9]+(?:\.[0-9]+)?)\s*(?:m|metres?)?\s*")
 _MOST_HEIGHT_M = 1000.0
-_DIGITS = 6  # corners are rounded to µm, because nearly level sides would have huge slopes
+_DIGITS = 6  # corners are rounded to µm, so that nearly level sides become level (no huge dx/dy)
 
 
 @dataclass(frozen=True)

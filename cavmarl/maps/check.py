@@ -55,8 +55,8 @@ class MapReport:
     signals_without_lanes: tuple[str, ...]  # traffic lights that control no lane
     lanes_never_green: tuple[str, ...]  # lanes whose signal never opens any movement
     # signal programs (signal/program) that are simplified: delay-based programs, NEMA programs and
-    # programs with several possible next phases run with their stated durations; limits of single
-    # links are ignored
+    # programs with several possible next phases run with their stated durations; parameters such as
+    # `linkMaxDur` and `coordinated` are ignored
     programs_simplified: tuple[str, ...]
     signals_held: tuple[str, ...]  # signals that show red for 1,000 s or more in one phase
     self_loops: tuple[str, ...]  # edges that end where they begin

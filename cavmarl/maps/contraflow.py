@@ -125,7 +125,7 @@ class _Contraflow:
             yield Element("connection", dict(one.items()) | words)
 
     def _beside(self, name: str) -> str:
-        """Return the map's own road in the direction of contraflow lanes, or `name` if none."""
+        """Return the map's own road beside contraflow lanes and in their direction, else `name`."""
         road = next(
             (edge for key, edge in self._reverses.items() if contraflow_of(key) == name), None
         )

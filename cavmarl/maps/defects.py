@@ -20,7 +20,7 @@ from cavmarl.roads.polylines import clean_shape
 from cavmarl.roads.sumo_net.road_corners import find_corners
 from cavmarl.roads.sumo_net.shared_strips import Road, Strip, find_strips
 
-STEP_M = 0.1  # minimum difference in height of lanes that lead into each other
+STEP_M = 0.1  # a larger difference in height of lanes that lead into each other is a defect
 SEARCHES = (
     "crossings", "signals", "lanes", "steps", "parts", "stop lines", "strips", "corners",
     "ground", "buildings",
@@ -84,7 +84,7 @@ def find_defects(
 
 
 def cut_off_edges(network: RoadNetwork) -> list[int]:
-    """Return edges for cars (EDGE rows) without a connection to and from the largest part."""
+    """Return edges for cars (EDGE rows) that neither lead to nor come from the largest part."""
     from cavmarl.maps.components import strong_components
 
     open_lanes = (network.lanes["permissions"] & CARS != 0) & ~network.lanes["internal"]
@@ -244,7 +244,7 @@ def _shared_strips(network: RoadNetwork, document: NetDocument) -> Iterator[Defe
     for strip in strips_of(network, document):
         for one, other in strip.lanes:
             x, y = network.lane_polyline(one)[0, :2].tolist()
-            words = f"with {network.lane_ids[other]}; the reader moves it {strip.apart_m:.1f} m"
+            words = f"with {network.lane_ids[other]}; cavmarl moves it {strip.apart_m:.1f} m"
             yield Defect("opposite lanes on one strip", network.lane_ids[one], x, y, words)
 
 
@@ -305,7 +305,7 @@ def _buildings_on_roads(
     network: RoadNetwork, document: NetDocument, buildings: Path
 ) -> Iterator[Defect]:
     """Find lanes inside buildings, except tunnels, passages and covered roads."""
-    # SUMO's polygons have no tags of ways.
+    # A file of SUMO's polygons has no ways, so nothing is covered.
     covered = {name for name, way in OsmRoads(buildings).ways.items() if way.is_covered}
     passages = {lane.id for lane in document.lanes if covered.intersection(lane.ways)}
     is_passage = np.array([id_ in passages for id_ in network.lane_ids], dtype=np.bool_)

@@ -107,7 +107,7 @@ def points_of(element: Element) -> Points:
 
 
 def shape_text(plane: list[str], heights_m: Points) -> str:
-    """Return a `shape` from positions in the plane, with the digits of the file, and heights."""
+    """Return a `shape`: positions in the plane, as written in the file, each with its height."""
     return " ".join(
         f"{place},{height:.{HEIGHT_DIGITS}f}"
         for place, height in zip(plane, heights_m.tolist(), strict=True)

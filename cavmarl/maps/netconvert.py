@@ -108,14 +108,14 @@ class BuildResult:
     source: Path  # the file from which it was built
     kind: MapKind  # kind of the source
     options: tuple[str, ...]  # netconvert's options; empty if a SUMO network was copied
-    # numbers of netconvert's warnings, by text without names and numbers
+    # how often each warning of netconvert occurred; in its text, names and numbers are `%`
     warnings: dict[str, int]
     # changes that netconvert reports: joined junctions, guessed roundabouts …
     corrections: tuple[str, ...]
     # with `tolerant`, ignored errors of netconvert; the named objects were left out
     dropped: tuple[str, ...]
-    provenance: dict[str, str]  # origin of the map, as written in its file
-    defaults: tuple[RoadDefaults, ...] = ()  # missing values, from the type map
+    provenance: dict[str, str]  # where the map comes from, as written in its file
+    defaults: tuple[RoadDefaults, ...] = ()  # values that the source lacks, from the type map
     notes: tuple[str, ...] = ()  # elements of the source that are not in the network, with counts
     heights: HeightReport | None = None
     levels: int = 0  # number of crossings of lanes on bridges or in tunnels; 0 with `heights`
@@ -151,8 +151,8 @@ def build_network(
             OSM, otherwise metres in the source's own frame.
         side: side of the road on which vehicles drive; None: the side of the country (OSM), or the
             `rule` of the roads (OpenDRIVE). A SUMO network has its own side.
-        origin: latitude and longitude of the map's x = y = 0, OSM only; by default the corner of
-            the roads, in UTM.
+        origin: latitude and longitude of the map's x = y = 0, OSM only; by default the south-west
+            corner of the roads' bounding box, in UTM.
         heights: terrain models for the roads; positions in the plane do not change. Without models,
             the ground is flat, and bridges and tunnels of OSM have heights where they cross roads.
         licences: licences of the source and of the terrain models; empty: the default.
@@ -312,7 +312,7 @@ class _Build:
         if place.exists() and place.samefile(self.source):
             raise MapError(f"{place}: the target is the source: give another target")
         place.parent.mkdir(parents=True, exist_ok=True)
-        cache = cache_dir() / "maps"  # one folder for all builds, so a build removes old drafts
+        cache = cache_dir() / "maps"  # one folder, so that any build removes drafts of killed ones
         with draft_folder(cache if place.is_relative_to(cache) else place.parent) as folder:
             draft = folder / f"{map_name(place)}.net.xml"
             self.told(STAGES[0])
@@ -409,7 +409,7 @@ class _Build:
         return run_netconvert(arguments, self.source, self.timeout_s, cures)
 
     def _finished(self, draft: Path) -> bytes:
-        """Return the network with the map's origin and heights added to netconvert's output."""
+        """Return netconvert's output with the map's provenance and heights."""
         if not self.options and self.heights is None and self.kind != "scene":
             return draft.read_bytes()
         self.told(STAGES[1])
@@ -430,7 +430,7 @@ class _Build:
         return content.replace(b"<net ", facts + b"<net ", 1)
 
     def _facts(self, document: NetDocument) -> dict[str, str]:
-        """Return the origin of the map, to be written into its file."""
+        """Return the provenance of the map, to be written into its file."""
         facts = read_provenance(self.source) if self.kind == "sumo" else {}
         if not facts:
             facts = {"source": self.source.name, "source sha256": source_hash(self.source)}

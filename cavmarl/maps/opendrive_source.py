@@ -1,4 +1,4 @@
-"""Prepares OpenDRIVE files for netconvert, which ignores limits of roads and left-hand traffic."""
+"""Prepares OpenDRIVE for netconvert, which ignores left-hand traffic and road speed limits."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ NO_LIMIT_MPS = 142.0 / 3.6  # netconvert's value for `maxspeed=none` of OSM
 WALKING_MPS = 5.0 / 3.6  # lower limits are more likely a wrong unit
 MAX_GEOMETRY_M = 100_000
 LENGTH_LIMIT = "CAVMARL_MAX_GEOMETRY_M"  # environment variable that changes this limit
-LEAST_PART_M = 1.0  # netconvert makes a separate edge for each limit along a road
+LEAST_PART_M = 1.0  # shortest part with its own limit, as netconvert makes an edge of each part
 
 _UNITS = {"m/s": 1.0, "km/h": 1.0 / 3.6, "kmh": 1.0 / 3.6, "kph": 1.0 / 3.6, "mph": 0.44704}
 # Lane types that vehicles drive on, with the speed of netconvert's type map in m/s.

@@ -16,7 +16,7 @@ from cavmarl.roads.sumo_net.xml_source import read_tree
 
 LANE_OPTIONS = ("--osm.turn-lanes", "--osm.lane-access")
 
-_JUNCTION = 3  # ends of ways that meet
+_JUNCTION = 3  # a node where this many ends of ways meet, or more, is a junction
 _AHEAD = ("turn:lanes", "turn:lanes:forward")
 _BACK = "turn:lanes:backward"
 _IGNORED = (
@@ -120,7 +120,7 @@ def _cut_ways(
             parts[name][own] = nodes[begin : end + 1]
         for own, refs in parts[name].items():
             roads.ways[own] = RoadWay(refs, roads.ways[name].tags)
-    # In the file, relations come after the ways.
+    # Relations must come after all ways in the file, including the new ones.
     relations = list(root.iter("relation"))
     for relation in relations:
         root.remove(relation)

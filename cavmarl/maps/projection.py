@@ -36,7 +36,7 @@ def project(source: Path | str, degrees: Places, geo: GeoReference) -> Places:
     """Return x and y in m (n, 2) of longitudes and latitudes (n, 2).
 
     Raises:
-        MapError: a place cannot be projected; `source` is the file, for the message; or PROJ does
+        MapError: a place cannot be projected (the message names the file `source`), or PROJ does
             not know the projection.
         MissingExtraError: pyproj is not installed.
     """

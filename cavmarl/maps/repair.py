@@ -59,7 +59,7 @@ def mend(source: Path, target: Path, before: Sequence[Defect]) -> tuple[list[str
 
 
 def _move_apart(document: NetDocument, network: RoadNetwork) -> None:
-    """Draw edges on the same strip, and the paths at their ends, as the reader has moved them."""
+    """Draw edges that share a strip, and the paths at their ends, where the reader placed them."""
     moved = {
         lane
         for strip in strips_of(network, document)

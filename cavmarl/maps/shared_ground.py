@@ -22,8 +22,8 @@ STEP_M = 1.0  # distance between the compared places of a lane
 def shared_ground(network: RoadNetwork) -> list[tuple[int, int]]:
     """Return pairs of LANE rows that are closer than a car's width and have no right of way.
 
-    The lanes of a pair belong to two roads and have no link between them, to two junctions that do
-    not lead to each other, or to a road and a junction that are not connected.
+    The lanes of a pair belong to two roads, without a link between the lanes; or to two junctions
+    that do not lead to each other; or to a road and a junction that are not connected.
     """
     grid = lane_grid(network)
     links = network.links[network.links["direction"] != ord("t")]
@@ -46,7 +46,7 @@ def shared_ground(network: RoadNetwork) -> list[tuple[int, int]]:
 
 
 def touching_roads(network: RoadNetwork) -> list[tuple[int, int]]:
-    """Return one pair of `shared_ground` for any two roads or junctions, if it is open to cars."""
+    """Return the first pair of `shared_ground` open to cars for each two roads or junctions."""
     cars = network.lanes["permissions"] & CARS != 0
     owners = _owners(network)
     found: dict[Any, tuple[int, int]] = {}

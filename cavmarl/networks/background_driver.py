@@ -1,4 +1,4 @@
-"""Trained drivers for background vehicles: the suitable drivers, and their networks.
+"""Trained drivers for background vehicles: which drivers are suitable, and why others are not.
 
 A background vehicle carries its own state in its record, which zones hand over. Therefore, the
 memory of its driver is limited to `MEMORY_FIELDS` of `driving.vehicles`: the controls and speeds of

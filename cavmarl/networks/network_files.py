@@ -26,7 +26,8 @@ from cavmarl.core.errors import ConfigError, PolicyError
 from cavmarl.roads.road_kinds import RoadKind
 
 CONTINUOUS_ACTIONS = 2
-# A residual driver's share of throttle and steering; small, to stay in the built-in driver's lane.
+# Factors of a residual driver's throttle and steering. That of steering is small, so that the
+# vehicle stays in the built-in driver's lane.
 RESIDUAL_PARTS = (1.0, 0.1)
 MAX_LAYERS = 8
 MAX_WIDTH = 4096

@@ -1,4 +1,4 @@
-"""Drivers for agents' vehicles, and the networks that trained drivers evaluate.
+"""Drivers for agents' vehicles: loading them, checking that they fit, and exporting them.
 
 Depends on `env`.
 """

@@ -38,8 +38,8 @@ def load_policy(policy: str | Path, env: Environment, *, beside_signals: bool = 
             that defines `make_policy(env)`, or a model file of stable-baselines3 (`.zip`),
             TorchScript (`.pt`, `.ts`) or ONNX (`.onnx`); see docs/guides/evaluate.md. Policies
             joined by `+` share the agents in turn (`merge_ippo+idm`: agents 0, 2, … and agents 1,
-            3, …). After `shielded:`, the built-in driver acts instead of the policy whenever it
-            would brake harder.
+            3, …). With the prefix `shielded:`, the built-in driver acts instead of the policy
+            whenever it would brake harder.
         env: a `CavEnv`, possibly wrapped, or a `CavVectorEnv`.
         beside_signals: whether the caller itself acts for the agents of signals, if there are any.
 

@@ -57,7 +57,7 @@ class ExtraRows(NamedTuple):
 
 
 def extra_table(parts: Sequence[ExtraRows], dtype: np.dtype[Any]) -> Any:
-    """Build a table of the rows of some frames, including rows before a frame's reset."""
+    """Build a table of the rows of some frames; rows from before a reset have their own part."""
     pa = arrow()
     rows = np.concatenate([np.zeros(0, dtype), *(part.rows for part in parts)])
     counts = [len(part.rows) for part in parts]
@@ -121,9 +121,10 @@ def extra_rows(path: Path, table: Any, dtype: np.dtype[Any]) -> tuple[Any, NDArr
 
 
 def take_rows(extras: Mapping[str, NDArray[np.void]], episode: int, tick: int) -> Any:
-    """Yield (table, `ExtraRows`) of a frame; rows of later ticks belong to the previous episode.
+    """Yield (table, `ExtraRows`) of a frame.
 
-    In a step in which the world restarts, the tick of the frame is smaller than before.
+    If the world has restarted in this step, the frame is the first of the new episode. Rows with a
+    larger tick than the frame were made before the restart and belong to the previous episode.
     """
     for name, rows in extras.items():
         late = rows["tick"] > tick

@@ -101,7 +101,7 @@ def _check_columns(recording: Recording) -> None:
 
 
 def _trip(world: int, episode: int, rows: NDArray[np.void]) -> RecordedTrip:
-    """Return the trip of rows (N + 1,); each row has a decision and its results."""
+    """Return the trip of rows (N + 1,): an observation each, and the decision that led to it."""
     after = rows[1:]
     # A vehicle that left at the horizon of its trip has both flags; its trip counts as truncated.
     terminated = bool(after["terminated"][-1] and not after["truncated"][-1])

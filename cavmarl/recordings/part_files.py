@@ -141,7 +141,7 @@ def _too_large(size: ParquetSize, file_bytes: int, schema: Any) -> str:
 
 
 def _plain_bytes(kind: Any) -> int:
-    """Return the size in bytes of a value of a column, without texts and lists of any length."""
+    """Return the size in bytes of a value of a column; 0 for text, and lists of variable length."""
     pa = require("pyarrow", "record")
     if pa.types.is_fixed_size_list(kind):
         return int(kind.list_size) * _plain_bytes(kind.value_type)
@@ -170,7 +170,7 @@ def _text_columns(schema: Any) -> list[str]:
 
 
 def _wrong_values(array: Any) -> str:
-    """Return whether an array has nulls, too many values, or too much text; empty if not."""
+    """Return what is wrong: nulls, too many values, or too much text; empty if nothing."""
     pa, compute = require("pyarrow", "record"), require("pyarrow.compute", "record")
     kind = array.type
     if array.null_count:

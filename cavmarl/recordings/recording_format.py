@@ -1,4 +1,4 @@
-"""The format of a recording on disk: its files, its columns, and frames as tables and back.
+"""The format of a recording on disk: files, columns, and conversion between frames and tables.
 
     PATH/recording.json         version, manifest, zones; written first, closed last
     PATH/network.bin            the map, as packed by `roads.cache.pack_network`
@@ -85,7 +85,7 @@ class RecordingHead:
 
     environment: str  # name and version
     sim_dt_s: float  # seconds per tick
-    step_s: float  # seconds between frames, unless the frame has another time
+    step_s: float  # usual seconds between frames; `time_s` of a frame is exact
     network: Mapping[str, str]  # name, source_sha256, layout, sha256 of the file
     bounds: Sequence[float]  # min_x, min_y, max_x, max_y of all zones in m
     rects: Sequence[Sequence[float]]  # min_x, min_y, max_x, max_y of each zone in m
@@ -94,7 +94,7 @@ class RecordingHead:
     status: str = "open"  # "closed" after an orderly end
     # optional tables by name: name, dtype and shape of each column
     extras: Mapping[str, Columns] = field(default_factory=dict)
-    features: Sequence[Sequence[str]] = ()  # sensor and name of each observed number, newest frame
+    features: Sequence[Sequence[str]] = ()  # sensor and name of each number of the newest frame
     terms: Sequence[str] = ()  # names of the reward terms
     version: int = FORMAT_VERSION
 
@@ -157,10 +157,9 @@ class RecordingHead:
         try:
             document = json.loads(read_file(path).decode())
         except FileNotFoundError:
-            kind = "an empty folder" if folder.is_dir() else "no folder"
+            kind = "the folder is no recording" if folder.is_dir() else "there is no such folder"
             raise RecordingError(
-                f"{folder}: no {HEAD_FILE}; it is {kind} or no recording: give the path that "
-                "was given to `record`"
+                f"{folder}: no {HEAD_FILE}; {kind}: give the path that was given to `record`"
             ) from None
         except (OSError, ValueError, RecursionError) as error:
             raise RecordingError(
@@ -357,7 +356,7 @@ def frames_of(
 
 
 def _lists_of(column: Any, kind: type[np.generic]) -> list[Any]:
-    """Return the lists of a column, and lists of lists, with numbers as arrays."""
+    """Return the lists of a column, or its lists of lists; the innermost lists become arrays."""
     array = arrow().concat_arrays(column.chunks or [arrow().array([], column.type)])
     offsets = array.offsets.to_numpy().tolist()
     if arrow().types.is_list(array.values.type):

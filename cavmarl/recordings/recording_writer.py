@@ -62,7 +62,8 @@ class RecordingWriter:
         terms: names of the reward terms, if observations are recorded.
 
     Attributes:
-        memory: memory for frames; only this writer reads their rows.
+        memory: for the rows of frames that only this writer reads; it is used again once they are
+            written.
 
     Raises:
         RecordingError: `path` exists and is not empty, or cannot be written.
@@ -299,7 +300,7 @@ class _WorldParts:
             self._extras[name].append(ExtraRows(self._last.episode, rows))
 
     def _at_the_end(self, last: WorldFrame, first: WorldFrame) -> Iterator[FrameEvent]:
-        """Yield the events of an episode's last step, whose last frame is not available."""
+        """Yield the events of an episode's last step, which has no frame: the world restarted."""
         ended = first.ended["agent"]
         stay = last.vehicles[~np.isin(last.vehicles["agent"], ended) | (last.vehicles["agent"] < 0)]
         stay = stay.copy()

@@ -36,7 +36,7 @@ def register_term(
         function: returns the value for an `AgentView` at the end of the step; if `batched`, the
             values (n,) for a `BatchView`. It must not depend on the order of `AgentView.others`;
             this is checked at its first use.
-        reach_m: maximum distance of the centres in `AgentView.others`; 0: no others.
+        reach_m: maximum distance from the agent's centre to those of `AgentView.others`; 0: none.
         batched: whether the function is called once for all agents of a world.
 
     Raises:

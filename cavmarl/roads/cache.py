@@ -33,7 +33,8 @@ from cavmarl.roads.network import (
 )
 from cavmarl.roads.sumo_net.reader import map_name, read_network, source_hash
 
-# Increase this if the reader returns different rows for a file. Record types are also hashed.
+# Increase this if the reader returns different rows for a file. A changed record type needs no
+# increase, because the record types are part of the hash.
 FORMAT = 52
 
 _DIGEST_BYTES = 32  # an entry begins with the SHA-256 of its rest; damaged entries are not read

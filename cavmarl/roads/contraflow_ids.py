@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-CONTRAFLOW = "contraflow:"  # prefix of the id of the reversed road
+CONTRAFLOW = "contraflow:"  # the id of the reversed road follows
 
 
 def contraflow_of(road: str) -> str:

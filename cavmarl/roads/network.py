@@ -60,15 +60,15 @@ POINT = record(
     ("right_s", np.float64),
 )
 
-# Fields that drivers read often come first and share a cache line.
+# The fields that drivers read most come first, so that they share a cache line.
 LANE = record(
     # arc length of the polyline in the plane: the `s` of its last point
     ("length_m", np.float64),
     ("speed_mps", np.float64),  # speed limit
     ("width_m", np.float64),
     ("internal", np.bool_),  # inside a junction
-    # whether vehicles that turn into the road at the lane's end yield to vehicles on this lane that
-    # are within `records.rows.MERGES_M`
+    # whether this lane's vehicles have the right of way over vehicles that turn, without a signal,
+    # into the road beyond its end; these watch the last `records.rows.MERGES_M` before that line
     ("merges", np.bool_),
     ("left", np.int32),  # LANE row of the left neighbour in the same direction
     ("right", np.int32),
@@ -82,7 +82,8 @@ LANE = record(
     ("edge", np.int32),  # EDGE row; also for internal lanes
     # internal lanes: path length of the link before this lane
     ("link_offset_m", np.float64),
-    ("stop_back_m", np.float64),  # from the stop line to the lane's end, where other paths sweep
+    # from the stop line to the lane's end; 0 unless other paths come near or the map says so
+    ("stop_back_m", np.float64),
     # into[first_into : first_into + num_into]: LANE rows that lead here (internal lanes if the map
     # has them)
     ("first_into", np.int32),
@@ -206,9 +207,10 @@ SWITCH = record(
 DETECTOR = record(
     ("lane", np.int32),  # LANE of the detector; its signal may be at the end of the next lane
     ("s_m", np.float64),  # position on that lane
-    ("max_gap_s", np.float64),  # maximum time between two vehicles if the second prolongs the green
+    ("max_gap_s", np.float64),  # the green ends after the detector was free this long
 )
 
+# A detector that vehicles on a lane can cover; a linked list per lane, see `RoadNetwork._places`.
 PLACE = record(
     ("next", np.int32),  # the next PLACE of the same lane
     ("detector", np.int32),
@@ -280,7 +282,8 @@ class RoadNetwork:
     left_hand: bool = False  # whether the map has left-hand traffic
     # differences from the lanes of the source, and elements that are not simulated, with counts
     notes: tuple[str, ...] = ()
-    joined: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, MAP))  # of several maps
+    # MAP rows if the network has several maps, else empty
+    joined: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, MAP))
     map_names: tuple[str, ...] = ()  # empty for a single map
     # WALL (num_walls,) of the buildings, if requested; see `maps.buildings`
     walls: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, WALL))

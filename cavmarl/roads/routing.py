@@ -1,7 +1,7 @@
 """Plans: for each goal, the lane-level route from every lane.
 
 A plan is a table over all lanes, not a list of edges. A vehicle that misses a turn or changes lanes
-has a new route at once. A record that moves to another zone describes its route by one number.
+has a new route at once. When a vehicle moves to another zone, one number describes its route.
 """
 
 from __future__ import annotations

@@ -71,11 +71,13 @@ def register_sensor(
             `batched`, an array (n, number of features) for a `BatchView` of n agents. The numbers
             must not depend on the order of `AgentView.others`; this is checked at the first use.
         features: meaning of each number; names are unique.
-        reach_m: largest distance to the centres of `AgentView.others`; if 0, `others` is empty.
+        reach_m: `AgentView.others` has the vehicles whose centres are within this distance of the
+            agent's centre; if 0, it is empty.
         batched: whether `sense` is called once per world, with all agents, instead of once per
             agent.
-        sides: change of the features if left and right are exchanged. Without `sides`, trained
-            drivers that observe the sensor cannot drive on the other side of the road.
+        sides: how the features change in a world in which left and right are exchanged. Without
+            `sides`, trained drivers that observe the sensor cannot drive on the other side of the
+            road.
 
     Raises:
         ConfigError: the name is taken, `reach_m` is negative or infinite, `features` is empty, or

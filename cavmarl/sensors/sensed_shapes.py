@@ -11,7 +11,7 @@ metres.
 | `links` | as `points`, with a line from the vehicle to each point |
 | `picture` | `width`, `height`, `rgba` (base64); `cone` [x, y, yaw_rad, opening_rad, range_m] |
 | `grid` | a picture on the ground; `corners`: both ends of the first row, start of the last row |
-| `numbers` | `rows` of a unit and a number |
+| `numbers` | `rows`: pairs [unit, number] |
 """
 
 from __future__ import annotations

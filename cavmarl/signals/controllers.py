@@ -107,7 +107,7 @@ class Actuated:
     """
 
     def choose(self, view: SignalView) -> NDArray[np.int64]:
-        """Start the next green if no detector of the current green was occupied during the gap."""
+        """Start the next green if the current one's detectors were free for `signals.max_gap_s`."""
         follows = np.empty(view.states.shape[:2], dtype=np.bool_)
         gap_ms = round(1e3 * view.config.max_gap_s)
         find_followers(
@@ -156,7 +156,7 @@ class MaxPressure:
     """
 
     def choose(self, view: SignalView) -> NDArray[np.int64]:
-        """Choose the green with the most vehicles on incoming and the fewest on outgoing lanes."""
+        """Choose the green with the most vehicles on incoming minus those on outgoing lanes."""
         return _best(view, view.table.pressure)
 
 
@@ -177,9 +177,7 @@ def make_controller(name: str) -> SignalController:
         ConfigError: there is no such controller.
     """
     if name not in CONTROLLERS:
-        raise ConfigError(
-            f"no controller of signals {name!r}: must be one of {', '.join(CONTROLLERS)}"
-        )
+        raise ConfigError(f"no signal controller {name!r}: must be one of {', '.join(CONTROLLERS)}")
     return CONTROLLERS[name]()
 
 
@@ -208,8 +206,8 @@ def _by_durations(
 ) -> NDArray[np.int64]:
     """Start the next green if the current green has lasted for its duration.
 
-    `green_s`: (W, S, G) durations. `early_s`: how long before the end of the duration the next
-    green may start.
+    `green_s`: (W, S, G) durations. `early_s`: the next green may start up to this long before
+    the duration ends.
     """
     green = view.states[..., GREEN]
     change_s = view.config.yellow_s + view.config.all_red_s

@@ -1,7 +1,7 @@
-"""`GreenFeatures`: the state of each green of each signal, for networks that score greens.
+"""`GreenFeatures`: the state of each green of each signal, for neural networks that score greens.
 
-The features of a green do not depend on the layout of its junction. So one network can control
-signals with any number of greens and lanes.
+The features of a green do not depend on the layout of its junction. So one neural network can
+control signals with any number of greens and lanes.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from cavmarl.signals.kernels.green_choices import GREEN, SINCE
 from cavmarl.signals.kernels.lane_counts import SPEED_PPM, STANDING, STOOD_TICKS, VEHICLES
 from cavmarl.signals.signal_table import SignalTable
 
-# Features of each green, with scales; sums and maxima are over the lanes that the green opens.
+# Features of each green; "/ 10": divided by 10. Sums and maxima are over the lanes that it opens.
 GREEN_FEATURES = (
     "exists",  # 1 for a green of the signal, 0 for padding
     "allowed",  # whether it may be chosen now
@@ -32,7 +32,7 @@ GREEN_FEATURES = (
     "pressure",  # see `SignalTable`, / 10
     "behind",  # vehicles on the outgoing lanes, / 20
     "standing_behind",  # stopped vehicles on the outgoing lanes, / 10
-    "most_filled",  # vehicles as a share of the vehicles that a lane holds
+    "most_filled",  # vehicles on a lane / stopped vehicles that fit on it; largest of the lanes
     "movements",  # number of movements that the green opens, / 5
 )
 SIGNAL_FEATURES = (
@@ -138,12 +138,12 @@ class GreenFeatures:
         return found
 
     def _sums(self, weights: NDArray[np.float32], lanes: NDArray[Any]) -> NDArray[Any]:
-        """Return the weighted sum for each green (W, S, G) of values of lanes (W, N)."""
+        """Return, for each green (W, S, G), the weighted sum of the lanes' values (W, N)."""
         found: NDArray[Any] = lanes @ weights.T
         return found.reshape(len(lanes), *self._shape)
 
     def _most(self, lanes: NDArray[Any]) -> NDArray[Any]:
-        """Return the largest value for each green (W, S, G) of values of lanes (W, N)."""
+        """Return, for each green (W, S, G), the largest of the values (W, N) of its lanes."""
         padded = np.pad(lanes, ((0, 0), (0, 1)))
         found: NDArray[Any] = padded[:, self._lanes].max(axis=2)
         return found.reshape(len(lanes), *self._shape)

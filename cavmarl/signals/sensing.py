@@ -19,7 +19,9 @@ from cavmarl.signals.signal_table import SignalSizes, SignalTable
 LOOP_M = 2.0  # length of a loop
 BEFORE_LINE_M = 1.0  # distance from the end of a loop to the stop line
 STANDING_S = 2.0  # a vehicle that covers a loop for this time counts as stopped
-CLEAR_S = 2.0  # added to the driving time from loop to loop at the speed limit
+# If the exit loop has been free for the driving time from loop to loop (at the speed limit) plus
+# this time, earlier vehicles have left.
+CLEAR_S = 2.0
 
 
 def make_cameras(
@@ -52,7 +54,8 @@ def make_loops(
 
     A lane that leads to a signal has a loop before the stop line, and a loop
     `signals.loop_upstream_m` before the line (on shorter lanes, at the start). A lane that only
-    leads away has a loop at its start, and a loop at that distance from the start, or at its end.
+    leads away has a loop at its start, and a loop `signals.loop_upstream_m` after the start (on
+    shorter lanes, at the end).
 
     Args:
         config: the positions.

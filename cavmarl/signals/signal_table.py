@@ -35,7 +35,8 @@ class SignalTable:
     Attributes:
         ids: ids of the signals (S,).
         greens: letters of the greens of each signal, as codes (num_greens, num_links).
-        lanes: ids of the lanes before and after the signals (N,).
+        lanes: ids of the lanes before and after the signals, then of the lanes that `lanes_before`
+            adds for `range_m` (N,).
         movements: for each signal, (M, 2) pairs of the lanes before and after a movement, as
             indices of `lanes`, in the order of the signal's links, without repetitions.
         opened: for each signal, (num_greens, M) whether a green opens a movement.
@@ -132,7 +133,8 @@ class SignalTable:
 def lanes_before(network: RoadNetwork, lane: int, range_m: float) -> list[int]:
     """Return the LANE rows that lead to a lane without a signal in between, nearest first.
 
-    The junction after each of them ends less than `range_m` before the given lane's end.
+    A row is included if the next lane outside of junctions begins less than `range_m` before the
+    end of the given lane.
     """
     found: dict[int, None] = {}
     ends = [(lane, 0.0)]
@@ -232,7 +234,8 @@ def _weights(
 ) -> LaneWeights:
     """Return the weights of lanes for each green, from the movements that the green opens.
 
-    Lanes `upstream` of lanes with a positive weight get the largest of these weights.
+    A lane that is `upstream` of lanes with positive weights gets, in addition to its own weight,
+    the largest of theirs.
     """
 
     def extended(found: dict[int, int]) -> dict[int, int]:
@@ -280,7 +283,10 @@ def _as_table(lists: Sequence[dict[int, int]]) -> LaneWeights:
 def _posts(
     incoming: list[list[int]], outgoing: list[list[int]], lanes: NDArray[np.void]
 ) -> LanePosts:
-    """Return where lanes, LANE (N,), are observed, given the lanes in and out of each signal."""
+    """Return where `lanes`, LANE (N,), are observed.
+
+    `incoming`, `outgoing`: indices of the lanes before and after each signal.
+    """
     signal = np.full(len(lanes), -1, dtype=np.int32)
     leads_in = np.zeros(len(lanes), dtype=np.bool_)
     for lists, is_in in ((incoming, True), (outgoing, False)):

@@ -124,7 +124,7 @@ class Bus:
 
     @contextmanager
     def muted(self) -> Iterator[None]:
-        """Suspend the network simulator in a context, in which no station receives anything."""
+        """Suspend the network simulator: in the context, it is not called and delivers nothing."""
         before, self._network = self._network, _Silence()
         try:
             yield
@@ -163,7 +163,8 @@ class Bus:
             return
         if self._network is None:
             raise ConfigError(
-                "v2x.channel.external: connect a network simulator before the first step"
+                "v2x.channel.external: connect a network simulator before the first step "
+                "(worlds.connect_network)"
             )
         for world in range(num_worlds):
             self._run(side, world, world + 1)
@@ -276,7 +277,7 @@ class Bus:
     def _closures_near(
         self, world: int, closed: NDArray[np.bool_]
     ) -> tuple[NDArray[np.float64], ...]:
-        """Return x, y, z, heading and EDGE row + 1 of the closed roads near each unit."""
+        """Return the closed roads near each unit: x, y, z, heading, EDGE row + 1 (0 is no road)."""
         known = self._closures.get(world)
         if known is None or not np.array_equal(known[0], closed):
             lanes, points = self._roads.lanes, self._roads.points

@@ -38,7 +38,7 @@ def chance_of_reception(config: ChannelConfig, distance_m: float, extra_db: floa
     probability is Φ((P - sensitivity) / σ).
 
     `config`: settings with a `path_loss_exponent` other than 0. `distance_m`: distance between the
-    antennas, at least 1 m is used. `extra_db`: additional loss, such as that of a building.
+    antennas; less than 1 m counts as 1 m. `extra_db`: additional loss, such as that of a building.
     """
     lost_db = 10.0 * config.path_loss_exponent * log10(max(distance_m, 1.0))
     power_dbm = config.tx_power_dbm - reference_loss_db() - lost_db - extra_db

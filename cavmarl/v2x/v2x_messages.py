@@ -15,7 +15,7 @@ All positions are centres of bodies, x east, y north, z up; headings are counter
 east. Ticks are ticks of the world. A station is a vehicle, given by its id, or roadside unit k,
 given by `FIRST_ROADSIDE_ID` + k.
 
-Roadside units are at signals, and send maps of these signals.
+Roadside units are at signals. A `MAP` never changes and is not sent; `map_of` returns it.
 
 An external network simulator (ns-3, OMNeT++ or any other) implements `NetworkSimulator.exchange`.
 The bus calls this method once per tick and world with the packets sent in that tick. The method
@@ -113,7 +113,9 @@ SPAT = np.dtype(
         ("sender", "<i8"),
         ("tick", "<i8"),
         ("signal", "<i4"),  # SIGNAL row
-        ("phase", "<i4"),  # current PHASE row, with the letters of all links; −1 − row: overridden
+        # current PHASE row, with the letters of all links; −1 − row if the caller overrides the
+        # state of some of them
+        ("phase", "<i4"),
         ("left_s", "<f8"),  # earliest remaining time of the phase, s
     ]
 )
@@ -211,7 +213,7 @@ def decode(data: bytes) -> tuple[np.void, NDArray[np.void]]:
         raise MessageError(f"message of kind {kind}: must be one of {', '.join(map(str, KINDS))}")
     size = HEADER.itemsize + count * KINDS[kind].itemsize
     if len(data) != size:
-        raise MessageError(f"message of {len(data)} bytes: {count} records need {size}")
+        raise MessageError(f"message of {len(data)} bytes: header and {count} records need {size}")
     return header, np.frombuffer(data, KINDS[kind], count, HEADER.itemsize)
 
 
@@ -239,7 +241,7 @@ class NetworkSimulator(Protocol):
     def exchange(self, sent: Exchange) -> NDArray[np.void]:
         """Simulate up to this tick.
 
-        If a host dies, a tick is repeated: the method gets the same packets again and must return
+        If a node dies, a tick is repeated: the method gets the same packets again and must return
         the same answer.
 
         Returns RECEPTION (n,): packets of this or earlier ticks that are received in this tick.

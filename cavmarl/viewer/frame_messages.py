@@ -51,7 +51,8 @@ MOST = 2**24 - 1  # largest coordinate, cm
 HEADINGS = 2048  # headings in a full turn
 SPEEDS_PER_MPS = 4.0
 BRAKING_MPS2 = -0.8  # brake lights are on at or below this
-REBASE_ROWS = 1000  # the whole roster is sent after twice the vehicles plus this many changes
+# The whole roster is sent after this many changed rows plus twice the number of vehicles.
+REBASE_ROWS = 1000
 REBASE_CHANGES = 256  # it is also sent after this many messages of changes
 
 

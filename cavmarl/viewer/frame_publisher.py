@@ -14,7 +14,7 @@ FRAMES_HZ = 20.0
 DETAILS_HZ = 5.0
 # Events on the time line; departures and signal changes are too frequent.
 TIME_LINE = frozenset({"collision", "off_road", "red_light", "arrived", "wrong_way", "transferred"})
-ASKED = frozenset({"inserted", "closed", "opened"})  # answers to pages, sent at once
+ASKED = frozenset({"inserted", "closed", "opened"})  # results of requests of pages, sent at once
 MOST_EVENTS = 50  # largest number of events sent with a frame
 
 FrameSource = Callable[[bool], WorldFrame]

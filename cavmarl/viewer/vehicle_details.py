@@ -34,7 +34,7 @@ DRIVERS = {
     DRIVER_SCRIPTED: "script",
     DRIVER_SUMO: "SUMO",
     DRIVER_EXTERNAL: "external",
-    DRIVER_LEARNED: "traffic (network)",
+    DRIVER_LEARNED: "traffic (neural network)",
 }
 MOST_NUMBERS = 400  # largest number of observed values to show
 ZONE_MARGIN_M = 50.0  # margin around the map up to which zones are drawn

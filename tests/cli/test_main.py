@@ -112,7 +112,7 @@ def test_evaluate_compares_drivers_in_repeated_runs_and_writes_a_page(
     assert run(*words, "--repeats", "2", "--out", str(out), "--html", str(page)) == 0
     shown = " ".join(capsys.readouterr().out.split())
     assert "2 runs of 1 episodes" in shown
-    assert "[95 % interval between runs], (SD within a run)" in shown
+    assert "95 % interval between runs (± or two limits), (SD within a run)" in shown
     assert "minus idm, paired by seed" in shown
     assert "<svg" in page.read_text(encoding="utf-8")
 

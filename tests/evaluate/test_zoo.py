@@ -63,7 +63,9 @@ def test_an_entry_of_a_different_world_is_refused(entry: Path) -> None:
     document = json.loads(path.read_text())
     document["world"]["config"]["clock"]["sim_dt_s"] = 0.1
     path.write_text(json.dumps(document))
-    with pytest.raises(ManifestError, match=r"config\.clock\.sim_dt_s is another in this version"):
+    with pytest.raises(
+        ManifestError, match=r"config\.clock\.sim_dt_s has another value in this version"
+    ):
         verify_entry(entry)
 
 

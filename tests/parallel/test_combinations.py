@@ -57,7 +57,7 @@ def _sumo(source: str) -> Callable[[Path], Keywords]:
 
 
 FEATURES: dict[str, Callable[[Path], Keywords]] = {
-    "frames, discrete actions, seats": _with(
+    "stacked frames, discrete actions, seats": _with(
         sensors__stack=3, action__kind="discrete", population__mode="respawn"
     ),
     "delayed commands": _with(clock__control_latency_ticks=2),

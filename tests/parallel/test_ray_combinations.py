@@ -24,7 +24,7 @@ def cluster() -> Iterator[None]:
 
 # Features in every test run: they cover the start of actors, a library that only the actor loads, a
 # file on its machine, and a refusal.
-OFTEN = ("frames, discrete actions, seats", "SUMO's traffic", "a journal", "sensor workers")
+OFTEN = ("stacked frames, discrete actions, seats", "SUMO's traffic", "a journal", "sensor workers")
 
 
 @pytest.mark.parametrize(

@@ -155,7 +155,7 @@ def test_a_table_of_another_part_is_refused(bad: Path) -> None:
 def test_an_empty_folder_a_file_and_a_missing_path_are_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(RecordingError, match="an empty folder"):
+    with pytest.raises(RecordingError, match="the folder is no recording"):
         Recording.open(tmp_path / "empty")
     for name in ("file", "nothing"):
         with pytest.raises(RecordingError):

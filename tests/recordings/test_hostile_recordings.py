@@ -153,7 +153,7 @@ FORGERIES: Sequence[tuple[Forge, str]] = [
     (columns_of(VEHICLES, with_swapped_columns("x", "y")), "it has the columns"),
     (text_of("world-0/handovers/000000.parquet", b"COMMIT", b"COMM\x80T"), "UTF8|UTF-8"),
     (many_rows(VEHICLES, 45, 100_000), "it has 4500000 rows"),
-    (many_rows(VEHICLES, 1, 100_000), "100000 rows of"),
+    (many_rows(VEHICLES, 1, 100_000), "100000 rows take"),
     (many_rows(FRAMES, 12, 100_000), "1200000 rows"),
     (head_with("extras", "observations", 5, 2, value=[2**30]), "rows of|list|terms|shape"),
     (head_with("extras", "observations", 8, 2, value=[]), "terms or features"),

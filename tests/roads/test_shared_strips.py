@@ -127,7 +127,7 @@ def test_the_check_names_shared_strips_and_the_repair_separates_them(tmp_path: P
     path, target = tram_street(tmp_path), tmp_path / "mended.net.xml"
     before = [one for one in find_defects(read_network(path), path) if one.kind == KIND]
     assert sorted(one.name for one in before) == ["0_1_1", "1_2_1", "2_3_1", "3_4_1"]
-    assert before[0].about == "with 1_0_1; the reader moves it 1.6 m"
+    assert before[0].about == "with 1_0_1; cavmarl moves it 1.6 m"
     done, left = mend(path, target, before)
     assert f"{KIND} 0_1_1: repaired" in done
     assert left == []

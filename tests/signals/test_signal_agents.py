@@ -571,7 +571,7 @@ def test_more_vehicles_arrive_with_max_pressure_than_with_the_program() -> None:
 
 
 def test_an_unknown_controller_is_refused() -> None:
-    with pytest.raises(ConfigError, match="no controller of signals 'greedy': must be one of prog"):
+    with pytest.raises(ConfigError, match="no signal controller 'greedy': must be one of prog"):
         make_controller("greedy")
 
 

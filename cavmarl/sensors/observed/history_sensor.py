@@ -39,7 +39,8 @@ def settings(config: SensorsConfig, at: int) -> HistorySensor:
 
 
 def reads(config: SensorsConfig) -> list[Reading]:
-    return [Reading("own vehicle", f"its controls and speeds of {config.history.steps} steps")]
+    what = f"its controls and speeds of the last {config.history.steps} steps"
+    return [Reading("own vehicle", what)]
 
 
 SENSOR = Sensor(

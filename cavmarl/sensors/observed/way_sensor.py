@@ -82,7 +82,7 @@ def reads(config: SensorsConfig) -> list[Reading]:
         found.append(Reading("map", what))
     if own.lines:
         lines = "stop line" if own.lines == 1 else f"{own.lines} stop lines"
-        within = f"the next {lines} within {own.range_m:g} m of its path"
+        within = f"the next {lines} up to {own.range_m:g} m ahead on its path"
         found.append(Reading("map", f"right of way at {within}"))
         found.append(Reading("ideal sensors", f"colours of the signals at {within}"))
         if own.timing:
