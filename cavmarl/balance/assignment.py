@@ -26,8 +26,9 @@ def assign(problem: Problem) -> tuple[Placement, str]:
 
     Shards without an answering worker go to the worker that finishes them first. Of the other
     shards, at most `max_moves` move, and only if the slowest worker exceeds a perfect division
-    (`fair_s`) by more than the tolerance. The gain must exceed both the tolerance's share of a tick
-    and the time of the moves. An excluded worker keeps its shards until balancing moves them.
+    (`fair_s`) by more than the tolerance. The gain per tick must be at least the tolerance times
+    `fair_s`, and must repay the time of the moves within `payback_ticks`. An excluded worker keeps
+    its shards until balancing moves them.
 
     Raises:
         NoAdmissibleWorkerError: shards need a place, and all workers are excluded; with
@@ -49,7 +50,10 @@ def assign(problem: Problem) -> tuple[Placement, str]:
 
 
 def _place(problem: Problem, workers: Workers) -> tuple[Placement, str]:
-    """Return a placement that is about as fast as `longest` and separates the fewest neighbours."""
+    """Of several placements, return the one that separates the fewest neighbours.
+
+    Placements that are slower than `longest` by more than the tolerance are left out.
+    """
     shards = range(len(problem.shards))
     nowhere = Placement(problem, workers, [-1 for _ in shards])
     if problem.in_row:

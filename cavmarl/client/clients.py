@@ -291,6 +291,8 @@ class AsyncClient:
             async for line in answer.aiter_lines():
                 if (event := _event_of(line)) is not None:
                     yield event
+        except httpx.TransportError:
+            return
         finally:
             await answer.aclose()
 

@@ -4,7 +4,8 @@ Commands are numbered: resets, steps, and changes between steps. A node answers 
 from memory, and from time to time stores the state of its worlds with the service. The client keeps
 the commands since the last stored state. If the node is lost, the service selects another node,
 which loads that state, and the client repeats the later commands. Equal commands give equal bytes.
-The client does not use the address of a node after its lease.
+After 60 % of a lease, the client asks for a new one before its next request to the node. A node
+refuses the token of a lease that has ended.
 """
 
 from __future__ import annotations
@@ -181,7 +182,7 @@ class WorldFlows:
     def frames(self, final: bool = False) -> Flow[dict[str, SensorFrames]]:
         """Return the samples of the mounted sensors, as `frames` of `make_vec` does.
 
-        With `final`, return the samples before the reset, as `final_frames` does.
+        With `final`, return the samples at the end of trips and episodes, as `final_frames` does.
         """
         params = {"final": 1} if final else {}
         answer = yield from self._asked("GET", SentCommand("frames", params))
@@ -316,7 +317,7 @@ class WorldFlows:
                 yield Rest(0.1)
 
     def _renew(self) -> Flow[None]:
-        """Request a new lease; the old one stays valid if the service is unreachable."""
+        """Request a new lease; while the service is unreachable, keep the old one and retry."""
         before = self.assignment["assigned"]
         try:
             yield from self._resolve(False)
@@ -340,10 +341,11 @@ class WorldFlows:
             return
         if number < self._saved:
             raise ServiceError(
-                f"session {self.session}: node {self.assignment['assigned']} has command {number}, "
-                f"but {self._saved} were saved: the store was changed; open another session"
+                f"session {self.session}: node {self.assignment['assigned']} has executed {number} "
+                f"commands, but {self._saved} were saved: the store was changed; open another "
+                "session"
             )
-        # A pending command is repeated by the caller that waits for its answer.
+        # `_asked` waits for the answer to a pending command, and sends that command again itself.
         for place in range(number + 1, self.number + (not self._is_pending)):
             sent = self._sent[place - self._saved - 1]
             params = {**sent.params, "number": place, "quiet": 1}

@@ -1,8 +1,8 @@
 """Files that are either complete or absent, even if the process or the machine stops.
 
-A file is written in a draft folder beside its destination. The process holds a lock on that folder:
-the next draft in the same place removes folders whose process has ended. If the file system has no
-locks, these folders stay.
+A file is written in a draft folder beside its destination. While the process lives, it holds a lock
+on that folder. The next draft in the same place removes folders whose process has ended. If the
+file system has no locks, these folders stay.
 """
 
 from __future__ import annotations

@@ -58,8 +58,8 @@ def huge_zeros(shape: int | tuple[int, ...], dtype: DTypeLike = np.float64) -> N
 def huge_copy(array: NDArray[Any], also_mapped: bool = False) -> NDArray[Any]:
     """Return the array in huge pages, with the same writeability.
 
-    Small arrays are returned unchanged. Arrays in huge pages or in a mapped file are so, too,
-    unless `also_mapped` is set.
+    Small arrays are returned unchanged. So are arrays that are already in huge pages or in a mapped
+    file, unless `also_mapped` is set.
     """
     if array.nbytes < LEAST or (_is_mapped(array) and not also_mapped):
         return array

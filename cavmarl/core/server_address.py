@@ -27,7 +27,7 @@ def listen(host: str, port: int, *, is_open: bool = True) -> socket.socket:
     Raises ServiceError: the address does not belong to this machine, or its port is in use.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    # asyncio disables Nagle's algorithm, which delays answers by 40 ms, only for a named protocol.
+    # Nagle's algorithm delays answers by 40 ms; asyncio disables it only if TCP is named here.
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:

@@ -38,7 +38,7 @@ SURVEY_RIG: dict[str, dict[str, Any]] = {
     },
 }  # fmt: skip
 
-_SETTLED_S = 5.0  # start of a drive whose frames are skipped while the filter finds its heading
+_SETTLED_S = 5.0  # frames of this time at the start are skipped: the filter finds its heading
 _STANDS_MPS = 0.3  # frames of slower vehicles are skipped: they show nothing new
 _FRAMES_HELD = 200  # frames collected before the cloud is thinned
 

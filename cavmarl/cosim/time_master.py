@@ -34,7 +34,7 @@ class Pacer(Protocol):
     """Determines when the next step may begin."""
 
     def wait(self, elapsed_s: float) -> None:
-        """Wait until the step may begin that starts after `elapsed_s` of simulated time."""
+        """Wait until the step that starts after `elapsed_s` of simulated time may begin."""
         ...
 
 

@@ -17,7 +17,7 @@ from cavmarl.core.errors import RegisteredFunctionError
 from cavmarl.driving.vehicles import GHOST_FIELDS, STATE_FIELDS
 from cavmarl.roads.network import RoadNetwork
 
-ORDER_CHECKS = 32  # per function, number of views with two or more others whose order is checked
+ORDER_CHECKS = 32  # number of views per function for which `_check_order` runs
 _OWN = list(STATE_FIELDS)
 _OTHERS = list(GHOST_FIELDS)
 

@@ -1,7 +1,7 @@
 """Swept areas of steered cars, for the maps of worlds with agents.
 
 Background vehicles have both bumpers on their paths. A steered car, whose axles are at its bumpers,
-turns late and drives with its front outside and its rear inside of a bend. So this module drives a
+turns late: in a bend, its front is outside and its rear inside of the path. So this module drives a
 car over the links in advance, and describes in SWEEP rows where it meets vehicles on other links.
 Only the built-in drivers of agents' vehicles read these rows.
 """

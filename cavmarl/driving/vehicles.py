@@ -65,8 +65,8 @@ VEHICLE = np.dtype(
         ("tick", np.int64),  # world tick to which this state belongs
         ("to_go", np.float64),  # remaining distance to the goal, along the plan, m
         ("distance_m", np.float64),  # driven since departure
-        # time in s that the driven distance takes at `free_speed`: the speed limit, for background
-        # vehicles times the speed factor, and at most the type's maximum speed
+        # time in s that the driven distance takes at `free_speed`: the speed limit (of background
+        # vehicles: times the speed factor), but at most the type's maximum speed
         ("free_s", np.float64),
         ("step_to_go", np.float64),  # to_go at the start of the current step
         ("step_jerk", np.float64),  # integral of |jerk| over the current step, m/s²
@@ -79,7 +79,7 @@ VEHICLE = np.dtype(
         # scripted vehicles, the current FRAME
         ("goal", np.int32),
         ("leg", np.int32),  # number of previous routes
-        # DEPARTURE row of a demand file, SUMO's number, or a caller's slot; -1: of the generator
+        # DEPARTURE row of a demand file, SUMO's number, or a caller's slot; -1: generated vehicle
         ("order", np.int32),
         ("departed", np.int64),  # tick of insertion
         ("due", np.int64),  # tick at which an agent's trip is cut off; -1: none

@@ -29,7 +29,8 @@ _MOST = 1 << 60  # limit of ticks and sums in a saved state
 class LimitComponent(Component):
     """A `Component` that sets the chosen limits, and observes the sections.
 
-    An episode begins with the highest limit of `limits.speeds_mps`.
+    A section is a list of edges whose vehicles are counted together, see `limits.sections`. An
+    episode begins with the highest limit of `limits.speeds_mps`.
 
     Attributes:
         table: the units that set limits.

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 class OutsideTraffic:
     """The part of a tick that another simulator or the caller may take over.
 
-    By default there are no such vehicles, and signals follow their own programs.
+    By default, neither moves vehicles, and signals follow their own programs.
 
     Attributes:
         sumo: SUMO, or None.
@@ -41,7 +41,7 @@ class OutsideTraffic:
         """Resume from the state of worlds that were loaded. Raises as `SumoTraffic` does."""
 
     def host(self, zones: Sequence[int]) -> None:
-        """Move vehicles in these zones only from now on: other processes run the other zones."""
+        """From now on, move vehicles only in these zones: other processes run the other zones."""
 
     def follow(self, tick: Tick) -> None:
         """Move the vehicles of the other simulator, after cavmarl's own vehicles."""

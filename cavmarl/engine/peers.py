@@ -40,8 +40,8 @@ class Peers:
     def all_zones(self, departures: DepartureQueue, side: int) -> AbstractContextManager[None]:
         """Return a context in which each process has the owned rows of all zones, on `side`.
 
-        Changes of rows are kept in the process that owns them. All processes must count the same in
-        `departures.counts` within the context.
+        Changes of rows are kept in the process that owns them. Within the
+        context, all processes must add the same numbers to `departures.counts`.
         """
         return nullcontext()
 

@@ -33,7 +33,8 @@ class TrafficStats:
     mean_speed_mps: float  # mean over the vehicles in the world now
     mean_trip_m: float  # mean over the arrived vehicles
     mean_trip_s: float  # mean over the arrived vehicles
-    # mean over arrived vehicles: trip time minus time at the speed that limit, driver, type allow
+    # mean over the arrived vehicles: trip time minus the time that the trip takes at the speed that
+    # limit, driver and type allow
     mean_delay_s: float
 
 

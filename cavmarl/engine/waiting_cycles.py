@@ -94,7 +94,10 @@ def _foes(
     queues: Mapping[int, Sequence[int]],
     link: int,
 ) -> list[int]:
-    """Return the vehicles on the links to which a link must yield, and the next to enter them."""
+    """Return the vehicles on the links to which a link must yield.
+
+    The result also has the next vehicle to enter each of these links.
+    """
     first = int(network.links["first_conflict"][link])
     conflicts = network.conflicts[first : first + int(network.links["num_conflicts"][link])]
     found: list[int] = []
@@ -122,7 +125,7 @@ def _next(
 
 
 def _cycles(waits: Mapping[int, Sequence[int]]) -> list[list[int]]:
-    """Return the cycles that a depth-first search finds, one for each edge back to its path."""
+    """Return cycles: one for each edge by which a depth-first search returns to its own path."""
     found: list[list[int]] = []
     done: set[int] = set()
     for start in sorted(waits):

@@ -210,7 +210,7 @@ def join(parts: Parts, shares: Sequence[Sequence[Array]]) -> list[Array]:
 def _shifted(
     parts: Parts, sumo: SumoTraffic, share: Sequence[Array], worlds: int
 ) -> Sequence[Array]:
-    """Return a copy of one world's share, with its vehicles and queue as of world `worlds`."""
+    """Return a copy of one world's share, with vehicles and queue converted to world `worlds`."""
     found = list(share)
     queue = sum(1 for _ in _fixed(parts))
     for n in (queue, *range(len(found) - parts.division.count, len(found))):

@@ -140,7 +140,7 @@ class ZonedShards:
             shard.cut(zones, halo)
 
     def _forget_offers(self, w: int) -> None:
-        """Forget vehicles near a border, so that they do not count as turned away."""
+        """Forget vehicles near a border, so that they do not count as turned back."""
         for known in (self.book.num_near, self.book.num_coming, self.book.known):
             known[w] = 0
 

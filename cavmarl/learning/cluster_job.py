@@ -104,7 +104,7 @@ class TrainingJob:
         if _child is not None:
             os.kill(_child.pid, signal.SIGTERM)
             until = time.monotonic() + SAVE_S
-            # `wait` of `subprocess.Popen` would need a lock that the interrupted `poll` may hold.
+            # The method of `subprocess` that waits would need a lock that the interrupted call may hold.
             while os.waitid(os.P_PID, _child.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is None:
                 if time.monotonic() > until:
                     os.kill(_child.pid, signal.SIGKILL)

@@ -47,7 +47,7 @@ class Replicas:
         if not self._newer(offer.vehicle, offer.epoch, tick):
             return held is not None and held[:3] == (offer.epoch, tick, offer.digest)
         if state_digest(offer.state) != offer.digest:
-            return Refusal.DIGEST  # damaged in transit; without a fence, it may be sent again
+            return Refusal.DIGEST  # damaged in transit; no fence is set, so it may be sent again
         if schema != self._limits.schema:
             return self.refuse(offer, tick, Refusal.SCHEMA)
         if held is None and len(self.held) >= self._limits.capacity:

@@ -121,9 +121,9 @@ class Table:
             zone, epoch = owners.pop(vehicle)
             counts[zone] -= 1
             moves.append((vehicle, zone, epoch, False))
-        # If there are more moves than vehicles, `tallies` counts the vehicles instead.
-        # So one move more than there are vehicles is enough. After further changes, there are still
-        # more moves than vehicles, because each new vehicle also adds a move.
+        # If there are more moves than vehicles, `tallies` counts the vehicles and does not read the
+        # moves. So only the length of the list matters, and one move too many is enough: later, it
+        # stays longer than the number of vehicles, because each new vehicle also adds a move.
         del moves[len(owners) + 1 :]
         self.tick = tick
 

@@ -114,7 +114,7 @@ class GuardedRequests:
 
     Args:
         app: the application to protect.
-        content_bytes: maximum size of a state or a result, which is read after authentication.
+        content_bytes: maximum size of a state, result or artefact, read after authentication.
         body_bytes: maximum size of any other body.
     """
 
@@ -165,5 +165,6 @@ class GuardedRequests:
         try:
             await self._app(scope, receive_in_time, send_with_headers)
         except Exception as error:
-            if scope.get(FAULT) is not error:  # the fault was logged, and the client has its answer
+            # An error kept as FAULT was logged, and the client has its answer.
+            if scope.get(FAULT) is not error:
                 raise

@@ -44,7 +44,7 @@ async def list_artefacts(
     service: TheService,
     own: Annotated[bool, Query(description="Return only artefacts of the caller")] = False,
 ) -> response_bodies.ArtefactList:
-    """Return artefacts: a client's own, or all of them."""
+    """Return artefacts; a client gets only its own."""
     known = service.broker.log.state.artefacts.items()
     shown = [
         _answer(owner, sha256, one)

@@ -111,7 +111,7 @@ class Artefacts:
         )
 
     def delete(self, identity: IdentityRecord, sha256: str) -> None:
-        """Delete a file of an identity that no open session or job of its needs."""
+        """Delete a file of an identity; refuse if one of its open sessions or jobs needs it."""
         if sha256 not in self.of(identity.id):
             raise problem("not-found", f"there is no artefact {sha256} of yours")
         if sha256 in self._in_use(identity.id):

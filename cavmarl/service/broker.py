@@ -1,7 +1,7 @@
 """The broker: registers nodes and assigns sessions and jobs to them.
 
-All decisions are made in one thread, between two events of the log, so concurrent requests see each
-other's effects. The clock is injected.
+All decisions are made in one thread, and no other event is recorded during a decision, so
+concurrent requests see each other's effects. The clock is injected.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class BrokerRules:
     idle_s: float = 600.0  # idle time after which a session ends
     keep_s: float = 3600.0  # how long ended sessions can be read
     keep_nodes_s: float = 86_400.0  # how long nodes that are down or have left are kept
-    max_losses: int = 10  # nodes lost since the last saved state of a job after which the job fails
+    max_losses: int = 10  # a job fails if it loses so many nodes without saving a new state
     max_skew_s: float = 5.0  # tolerated difference of the clocks of a node and of the service
     max_nodes: int = 10_000
     max_sessions: int = 1000  # open sessions of one identity
@@ -97,7 +97,7 @@ class Broker:
     # Nodes
 
     def register(self, identity: IdentityRecord, body: NodeBody) -> NodeRecord:
-        """Register a node, or register it again; reports of its earlier process are ignored."""
+        """Register a node, or register it again; reports of its earlier process are refused."""
         known = self.log.state.nodes.get(body.name)
         owner = known and self.log.state.identities.get(known.identity)
         if owner and owner.id != identity.id and not owner.revoked:

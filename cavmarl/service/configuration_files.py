@@ -72,7 +72,11 @@ def check_files(environment: str, files: Mapping[str, str]) -> None:
             )
     is_environment = has_environment(environment, files)
     if environment in files and not environment.endswith(MAP_SUFFIXES):
-        raise problem("refused", f"environment: {environment} must be a map, or a name")
+        raise problem(
+            "refused",
+            f"environment: the uploaded file {environment} is not a map: give a map, or the "
+            "name of an environment",
+        )
     for place in files:
         top = place.split("/")[0]
         if top in _RESERVED and top != place:
@@ -157,7 +161,8 @@ def _check_yaml(place: str, found: Any, files: Mapping[str, Any]) -> None:
     if place == ENVIRONMENT_FILE and isinstance(found, dict) and "plugins" in found:
         raise problem(
             "refused",
-            "plugins: name modules, which are code; an uploaded environment must not have the key",
+            "plugins: its entries name modules, which are code; an uploaded environment must not "
+            "have the key",
         )
     _check_texts(place, found, files)
 
@@ -182,7 +187,7 @@ def _check_texts(place: str, value: Any, files: Mapping[str, Any]) -> None:
 
 
 def placed_policies(policies: Sequence[str], files: Mapping[str, str], folder: str) -> list[str]:
-    """Return the drivers of a job, with the folders of the uploaded ones."""
+    """Return the drivers of a job, with the folder of an uploaded driver in place of its name."""
     own = drivers_of(files)
     return [str(Path(folder, DRIVER_FOLDER, name)) if name in own else name for name in policies]
 

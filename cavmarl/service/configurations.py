@@ -1,8 +1,8 @@
 """Configurations of worlds: immutable, identified by hash, with numbered versions per name.
 
-A configuration from the network refers to entries of this installation, or to files that its owner
-has uploaded. It must not name other files or code: in an entry, keys with file names must have the
-same values as in the entry.
+A configuration from the network refers to installed environments and drivers, or to files that its
+owner has uploaded. It must not name other files or code, so its overrides must not change the keys
+of its environment that have file names as values.
 """
 
 from __future__ import annotations
@@ -167,8 +167,9 @@ def _check(document: dict[str, Any], files: Mapping[str, bytes]) -> None:
     if "plugins" in document["overrides"]:
         raise problem(
             "refused",
-            "plugins: name modules, which are code, and cannot be overridden; the service and its "
-            "nodes import only the modules that the env.yaml of an installed environment names",
+            "plugins: its entries name modules, which are code, so the key cannot be overridden; "
+            "the service and its nodes import only the modules that the env.yaml of an installed "
+            "environment names",
         )
     for text in _texts(document["overrides"]):
         if not _PLAIN.fullmatch(text):

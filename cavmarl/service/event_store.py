@@ -44,8 +44,8 @@ from cavmarl.service.snapshots import SealedSnapshot
 SCHEMA = "cavmarl.service/2"
 _LOCK_KEY = 0x6361766D  # key of PostgreSQL's advisory lock
 _PAGE = 1000  # lines that one query reads
-# PostgreSQL ends the connection, and so the lock, of a machine that does not answer for 4 s. The
-# service ends the connection to a machine of PostgreSQL that does not answer after the same time.
+# PostgreSQL ends the connection, and so the lock, of a machine that does not answer for 4 s. After
+# the same time, the service ends its connection to a machine of PostgreSQL that does not answer.
 _DEAD_PEERS = {
     "options": "-c tcp_keepalives_idle=1 -c tcp_keepalives_interval=1 -c tcp_keepalives_count=3 "
     "-c tcp_user_timeout=4000",
@@ -120,7 +120,7 @@ class EventStore:
 
     Args:
         where: an SQLite file, or the URL of a database.
-        is_standby: whether another service may use the store now, until `try_lock` returns true.
+        is_standby: whether another service may own the store until `try_lock` returns true.
 
     Raises:
         ServiceError: the store cannot be opened, is in use by another service, or has another

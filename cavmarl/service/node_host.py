@@ -38,7 +38,7 @@ from cavmarl.service.training_settings import CAPABILITY, RUN
 from cavmarl.service.zone_processes import ZoneProcesses
 
 TELL_S = 0.5  # time between two progress reports of a job
-DRAIN_S = 60.0  # after which a drained node ends even if sessions are left
+DRAIN_S = 60.0  # time after SIGTERM at which a node ends even if sessions are left
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class NodeOptions:
     name: str
     host: str = "127.0.0.1"
     port: int = 0  # port for clients; 0 picks a free port
-    simulator_port: int | None = None  # reported to clients, which connect to `port`; None: `port`
+    simulator_port: int | None = None  # only reported to clients; cavmarl does not use it
     slots: int = 4
     capabilities: tuple[str, ...] = ()
     allowed: tuple[str, ...] = ()

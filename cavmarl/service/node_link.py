@@ -127,7 +127,7 @@ class NodeLink:
         return {*told, *self._expected}
 
     async def public_key(self, number: str, pause_s: float = KEYS_S) -> Any:
-        """Return a key that verifies tokens; raise KeyError if the service is known to have none.
+        """Return a key that verifies tokens; raise KeyError if the service has listed no such key.
 
         Args:
             number: id of the key.
@@ -226,7 +226,7 @@ class NodeLink:
         await self.ask("PUT", path, content=state, params={"at": number})
 
     async def open_door(self, session: str, document: dict[str, Any]) -> dict[str, Any]:
-        """Ask other nodes to host zones of a session; return keywords of `make_vec` for them."""
+        """Let other nodes host zones of a session; return keywords to await them in `make_vec`."""
         if not document.get("nodes"):
             return {}
         host: str = self._body["address"]
@@ -306,8 +306,8 @@ async def until_answered(ask: Callable[[], Awaitable[T]]) -> T:
 def must_register(error: ServiceError) -> bool:
     """Return whether the node must register again, because its heartbeats are refused.
 
-    A refused number means that another process has sent heartbeats as this node. The new
-    registration has another incarnation, so that process is refused from then on.
+    A heartbeat with a refused number means that another process has sent heartbeats as this node.
+    The new registration has another incarnation, so that process is refused from then on.
     """
     return error.problem in ("conflict", "not-found", "stale-beat")
 

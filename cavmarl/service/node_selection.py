@@ -1,9 +1,10 @@
-"""Selection of a node for a session: exclusions first, then eq. (1) and (2) of `balance`.
+"""Selection of a node for a session, by eq. (1) and (2) of `cavmarl.balance.load_score`.
 
-A node is also excluded by its slots, its capabilities, the identities that it serves, or the age of
-its last heartbeat. A session assigned since the last heartbeat is not part of the reported load. It
-counts as one slot's share of the processor, so that concurrent requests do not all go to the node
-that was idle a second ago. That share never excludes a node.
+Overloaded nodes are excluded. A node is also excluded by its slots, its capabilities, the
+identities that it serves, its state, or the age of its last heartbeat. A session assigned since the
+last heartbeat is not part of the reported load. It counts as one slot's share of the processor, so
+that concurrent requests do not all go to the node that was idle a second ago. That share never
+excludes a node.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class Exclusion(NamedTuple):
 
 @dataclass
 class LiveNode:
-    """The state of a node that is not in the log: its last heartbeat.
+    """The part of a node's state that is not in the log: its last heartbeat, and what it hosts.
 
     Attributes:
         number: order of registration, which breaks ties.
@@ -53,7 +54,7 @@ class LiveNode:
     muted: set[str] = field(default_factory=set)  # hosted sessions that are not in `use` yet
     zones_of: list[str] = field(
         default_factory=list
-    )  # sessions whose zones it hosts, once per part
+    )  # sessions with zones on this node, once per part of the zones
     counters: dict[str, float] = field(default_factory=dict)  # counters for /metrics
     jobs: dict[str, list[int]] = field(default_factory=dict)  # job → steps done, total
     candidate: Candidate | None = None  # cached input of `select`

@@ -1,7 +1,7 @@
-"""Training jobs on a node. The program has its own process; its run is the job's saved state.
+"""Training jobs on a node: the program `train/ppo.py` trains in a process of its own.
 
-While the program trains, the node stores the run's last checkpoint with the service. If the node is
-lost or drained, another node continues the run from there.
+Meanwhile, the node stores the files of the run, with its last checkpoint, as the job's state with
+the service. If the node is lost or drained, another node continues the run from there.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ from cavmarl.core.errors import CavmarlError, ServiceError
 from cavmarl.service.error_names import PROBLEM_TYPE, PROBLEMS, without_folders
 from cavmarl.service.node_selection import NoNodeError
 
-MOST_EXCLUSIONS = 100  # maximum number of errors in an answer
+MOST_EXCLUSIONS = 100  # maximum number of excluded nodes in an answer
 FAULT = "cavmarl.fault"  # key of an ASGI scope: the exception of a failed request
 
 _BY_STATUS = {404: "not-found", 405: "wrong-method", 408: "slow-body", 413: "too-large"}
@@ -93,7 +93,7 @@ async def _on_validation(request: Request, error: Exception) -> JSONResponse:
     ]
     detail = "; ".join(places)
     beat = _BEAT.fullmatch(request.scope["path"])
-    identity = getattr(request.state, "identity", None)  # None: the body is not JSON
+    identity = getattr(request.state, "identity", None)  # None: the route has no `Rule`
     if beat and identity and request.app.state.on_misreport:
         request.app.state.on_misreport(identity, beat[1], detail)
     return _refuse(request, "bad-body", detail)

@@ -77,7 +77,7 @@ class NodeStatus(_Answer):
     load: Load | None  # null: no heartbeat yet
     score: float | None
     sessions: int
-    zones_of: list[str]  # sessions whose zones it hosts, once per part
+    zones_of: list[str]  # sessions with zones on this node, once per part of the zones
     age_s: float  # seconds since the last heartbeat
 
 

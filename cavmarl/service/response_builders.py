@@ -26,7 +26,7 @@ KEEP_ALIVE_S = 15.0
 async def assigned(
     service: Service,
     identity: IdentityRecord,
-    subject: str,  # name of the event if no node was found
+    subject: str,  # subject of the event that is recorded if no node is found
     take: Callable[[], SessionRecord],
     wait_s: float,
 ) -> response_bodies.Assignment:

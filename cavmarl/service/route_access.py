@@ -64,7 +64,7 @@ class Service:
 
     @contextmanager
     def counting_wrong_secrets(self, request: Request) -> Iterator[None]:
-        """Count wrong secrets by address, but not valid ones, so callers do not block others."""
+        """Count wrong secrets by address; valid ones pass at any count, so nobody blocks others."""
         try:
             yield
         except ServiceError as error:

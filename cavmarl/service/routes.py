@@ -94,7 +94,7 @@ async def withdraw(identity: Everyone, service: TheService) -> None:
 
 @nodes.post(
     "/{name}/beat", response_model=response_bodies.Duties
-)  # not validated again, as heartbeats are frequent
+)  # the answer is not validated, as heartbeats are frequent
 async def beat(
     identity: Nodes, service: TheService, name: NodeName, body: request_bodies.BeatBody
 ) -> JSONResponse:
@@ -177,7 +177,7 @@ async def open_session(
     body: request_bodies.SessionBody,
     key: IdempotencyKey = "",
 ) -> response_bodies.Assignment:
-    """Open a session on the node that eq. (1) and (2) choose, or on a preferred node."""
+    """Open a session on the admissible node with the lowest LoadScore, or on a preferred node."""
     found = configurations.read_configuration(service.broker.log, body.configuration)
 
     def opened() -> SessionRecord:
@@ -207,7 +207,7 @@ async def resolve(
 
 @worlds.get("/sessions")
 async def list_sessions(identity: Readers, service: TheService) -> response_bodies.SessionList:
-    """Return sessions and jobs: a client's own, or all of them."""
+    """Return sessions and jobs; a client gets only its own."""
     found = service.broker.log.state.sessions.values()
     own = [one for one in found if identity.role != "client" or one.owner == identity.id]
     return response_bodies.SessionList(sessions=[session_answer(service, one) for one in own])

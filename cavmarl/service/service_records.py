@@ -69,7 +69,7 @@ class SessionRecord:
     node: str | None = None
     incarnation: int = 0  # incarnation of `node`
     placements: int = 0  # how often it was assigned to a node
-    losses: int = 0  # nodes that were lost or left with it since its state was last saved
+    losses: int = 0  # times that its node was lost or left since its state was last saved
     reason: str = ""  # why that node was chosen
     score: float = 0.0  # LoadScore of that node when it was chosen
     excluded: list[dict[str, Any]] = field(
@@ -148,7 +148,7 @@ class Infrastructure:
         return found
 
     def _replace_user(self, new: str | None, old: str | None) -> None:
-        """Count the reference to `new` content that takes the place of a reference to `old`."""
+        """Count one more reference to content `new`, and one less to `old`. None: no content."""
         if new is not None:
             self.users[new] += 1
             self.unused.discard(new)

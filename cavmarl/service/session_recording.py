@@ -38,7 +38,8 @@ class SessionRecording:
         vec: the worlds.
         include: additional tables.
         part: number of the first part that this node records.
-        files: folder with the files of the session, which parts do not name; empty: it has none.
+        files: folder with the files of the session; its path is removed from each part. Empty: the
+            session has no files.
 
     Attributes:
         waiting: parts that have ended and are not stored with the service yet.

@@ -492,7 +492,7 @@ class SessionWorlds:
         return [session for session, world in list(self._worlds.items()) if world.is_divided]
 
     def keep_only(self, sessions: set[str]) -> None:
-        """Close sessions that are now hosted by other nodes."""
+        """Close all sessions except these: they have ended, or other nodes host them now."""
         for session in [one for one in self._worlds if one not in sessions]:
             self.close(session)
 

@@ -1,9 +1,10 @@
 """Selection of the nodes that host the zones of a session on several nodes.
 
 The session's own node leads: it receives the commands, and waits for the other nodes at an address
-that it reports. The other nodes are selected like nodes of sessions, on as many machines as
-possible. A node that is lost or drained is replaced, and the worlds continue from the states that
-other nodes keep (docs/guides/nodes.md).
+that it reports. The zones are divided into one part per wanted node. For each part, a node is
+selected like a node of a session, if possible one without another part of this session. A node that
+is lost or drained is replaced, and the worlds continue from the states that other nodes keep
+(docs/guides/nodes.md).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Processes of a node that host zones of other nodes' sessions, one per part."""
+"""Processes of a node that host zones of sessions; each process hosts one part of the zones."""
 
 from __future__ import annotations
 

@@ -204,10 +204,11 @@ class RowCheck:
         wrong |= (rows["lane_stood"] < -1) | (stood_lane >= self._num_lanes)
         if not wrong.any():
             return ""
-        return _of(rows[np.argmax(wrong)], "order", "is invalid, or its id, tick or lane_stood is")
+        problem = "is invalid, or the vehicle's id, tick or lane_stood is invalid"
+        return _of(rows[np.argmax(wrong)], "order", problem)
 
     def _wrong_ways(self, rows: NDArray[np.void], tail: NDArray[np.void] | None) -> str:
-        """Check that routes are valid. Follow a route if its first step may be of another lane."""
+        """Check that routes are valid; follow those whose first step may belong to another lane."""
         lane, way = self._own_lanes(rows["lane"]), rows["way"]
         at = way + lane
         if wrong := self._wrong_places(rows, lane, way):

@@ -81,7 +81,10 @@ class ShardGroup:
         self.departure_calls(departures).leave()
 
     def dismiss(self, departures: DepartureQueue) -> None:
-        """Move vehicles of the next rows that SUMO or the caller removes to the departure queue."""
+        """Move vehicles of the next rows to the departure queue.
+
+        These are the vehicles that SUMO or the caller removes.
+        """
         self.departure_calls(departures).dismiss()
 
     def gather(self, touching_m: float, border_m: float) -> None:

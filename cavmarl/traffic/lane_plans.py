@@ -14,7 +14,7 @@ from cavmarl.roads.kernels.plans import plan_goal
 from cavmarl.roads.network import CARS
 from cavmarl.traffic.kernels.way_requests import CLOSED_S
 
-# s to drive along a closed contraflow lane; any route over closed lanes of roads is faster
+# s to drive along a closed contraflow lane: longer than any route over other closed lanes
 SHUT_S = 1000.0 * CLOSED_S
 
 

@@ -107,7 +107,7 @@ class TrafficCalls:
 
 @dataclass(frozen=True)
 class NativeTraffic:
-    """The departures on one map for one population, as a TrafficSource."""
+    """The departures of one population on the maps of a network."""
 
     network: RoadNetwork
     traffic: TrafficConfig  # settings of the generator
@@ -271,7 +271,7 @@ class NativeTraffic:
 
     @cached_property
     def _agent_type_rows(self) -> NDArray[np.int32]:
-        """VTYPE row of each agent's type, repeated in order."""
+        """VTYPE rows of the agents' types, which agents use in turn by their number."""
         rows = self.type_rows
         return np.array([rows[name] for name in self.population.agent_types], dtype=np.int32)
 
@@ -559,7 +559,7 @@ class NativeTraffic:
 
     @cached_property
     def at_reset(self) -> NDArray[np.void]:
-        """EXTERNAL (L,) of the replayed road users at the reset; absent users are removed."""
+        """EXTERNAL (L,) of the replayed road users at the reset; EXTERNAL_REMOVED if absent."""
         log = None if self.scene is None else self.scene.log
         commands: NDArray[np.void] = logged_commands(log, self.type_rows, self.dt)[0]
         return commands

@@ -2,8 +2,8 @@
 
 Three mechanisms reroute vehicles. Vehicles react once to each change of lanes by the caller. SUMO's
 rerouting device searches for the fastest route by the speeds of the last minutes. <rerouter>s act
-on vehicles that drive on their edges. All mechanisms run once a second beside the departure queue,
-in one place even if the world is divided. Decision 011 gives the reasons.
+on vehicles that drive on their edges. All mechanisms run once a second. Like the departure queue,
+they run in one place even if the world is divided. Decision 011 gives the reasons.
 """
 
 from __future__ import annotations

@@ -171,8 +171,8 @@ class Schedule:
             return ways.edges(named, mask)
         except RouteError as error:
             raise RouteError(
-                f"{self._place(route)}: {error} of the map '{self._network.name}' for the class of "
-                "a trip between them: change the trip, or set traffic.on_bad_route = skip"
+                f"{self._place(route)}: {error} of the map '{self._network.name}' for the vehicle "
+                "class of a trip; change the trip, or set traffic.on_bad_route = skip"
             ) from None
 
     def _place(self, route: int) -> str:

@@ -103,9 +103,9 @@ class _Trial:
         ends = lanes[0], begin_m, lanes[-1], end_m
         stays = self._drives(*ends)
         if stays:
-            # In the first drive, the plan has link 0 in place of the turn's link. With the turn's
-            # link, the car may cut the corner. So the turn is too tight only if the car's centre
-            # leaves the road at each of the speeds.
+            # In the drive above, the plan has link 0 in place of the turn's link. With the turn's
+            # link, the car may cut the corner, so only its centre is checked here: the turn is too
+            # tight only if the centre leaves the road at both speeds.
             self._plan["link"][0, lanes[0]] = link
             stays = any(self._drives(*ends, speed, False) for speed in (TRIAL_MPS, FASTER_MPS))
             self._plan["link"][0, lanes[0]] = 0

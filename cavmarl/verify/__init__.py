@@ -1,4 +1,4 @@
-"""Checks that results are bit for bit the same: repeated, divided into zones, with faults.
+"""Checks that a run that is repeated, divided into zones or hit by faults has the same bits.
 
 This package builds on `evaluate`; `cli` runs the checks.
 """

@@ -21,7 +21,7 @@ NUMBER = r"[-+]?(?:[0-9]{1,3}(?:,[0-9]{3})+|[0-9]+)(?:\.[0-9]+)?"
 FREE_NUMBER = re.compile(rf"(?<![\w.,]){NUMBER}")  # excludes the end of names and versions
 _TOLERANCE = re.compile(
     r"exact|range(?: {0}{1} %)?|{0}{1} %|[0-9]+{1}".format("[0-9]{1,2}", r"(?:\.[0-9]+)?")
-)  # N % is below 100 %, which would accept every published number that is too large
+)  # N % is below 100 %: a tolerance of 100 % accepts any published number that is too large
 _NEEDS = ("module", "program", "variable", "file")
 
 
@@ -48,9 +48,9 @@ class PublishedLine:
             in place of `-`; the final `_` stays.
         rows: label of a row → value that replaces the word; empty: all rows, with their labels.
         columns: text of the header → expression.
-        tolerance: `exact` (equal in the digits of the page); `N %` of the published number; `N`;
-            `range` (measured values lie between the two published numbers); `range N %` (the range
-            is wider by N % on both sides).
+        tolerance: `exact` (equal in the digits of the page); `N %` of the published number; `N`
+            (largest difference); `range` (measured values lie between the two published numbers);
+            `range N %` (the range is wider by N % on both sides).
         needs: requirements: `module:NAME`, `program:NAME`, `variable:NAME` of the environment, or
             `file:WORD`, where WORD is a word of the command that `--file` replaces.
         minutes: how long the command takes.

@@ -32,7 +32,7 @@ class Fault(StrEnum):
 
     DELAY = "delay"  # a frame and its successors on the connection arrive up to 0.5 s late
     SPLIT = "split"  # a frame arrives in two pieces
-    OVERTAKE = "overtake"  # a frame arrives after frames that were sent later on other links
+    OVERTAKE = "overtake"  # a frame arrives after frames that were sent later on other connections
     SLOW = "slow"  # the zones of a node take longer
     CLOCK_SKEW = "clock_skew"  # a clock jumps forward, and continues at another rate
     STALE_HEARTBEAT = "stale_heartbeat"  # a node answers a ping late, but within the time limit

@@ -232,8 +232,8 @@ class SimulatedSocket:
 
     Attributes:
         due: fault of the next frame: a function that returns the pieces to be delivered.
-        on_arrival: called when the next frame arrives, with whether the receiver already has a
-            frame that was sent later over another connection.
+        on_arrival: called when the next frame arrives; the argument is true if the receiver already
+            has a frame that was sent later over another connection.
         held_until_s: no bytes in this direction arrive before this time.
         is_mute: whether no sent bytes arrive, without notice to the sender.
     """

@@ -98,7 +98,7 @@ def verify_kills(
 
     Raises:
         ConfigError: a number is invalid.
-        WorkerError: a worker died without a signal.
+        EvaluationError: a worker died without a signal.
     """
     spec = WorldSpec.of(env, **keys)
     seed = spec.seed

@@ -68,7 +68,7 @@ def off_lane_m(network: RoadNetwork, travel: TripTables) -> float:
 
 
 def _kink_m(network: RoadNetwork) -> float:
-    """Return the longest jump of a point a lane's width aside, at a kink of a lane's line."""
+    """Return how far a point one lane's width beside a lane's line can jump at a kink."""
     lanes, links = network.lanes, network.links
     direction = np.stack([network.points["cos"], network.points["sin"]], axis=1)
     first = lanes["first_point"]

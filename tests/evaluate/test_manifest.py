@@ -77,7 +77,7 @@ def test_ignored_parts_of_demand_are_reported_once_and_recorded(
     demand = {"traffic.demand": [str(path)]}
     said = [
         f"       1 <person> is not read (first: {path}, line 1)",
-        "       1 the demand begins at 25200 s, as no vehicle departs in the 1 s from 0 s "
+        "       1 the demand begins at 25200 s, as no vehicle departs from 0 s to 1 s "
         f"(first: {path}, line 1)",
     ]
     assert manifest(background=0, overrides=demand)["world"]["demand_tolerated"] == said

@@ -205,7 +205,7 @@ def test_an_unused_file_is_deleted_after_its_lifetime(fleet: Fleet) -> None:
         (b"map: {source: ../map.net.xml}", "could name a file that was not uploaded"),
         (b"map: {source: 'sumo:../../map.net.xml'}", "could name a file that was not uploaded"),
         (b"map: {source: map.net.xml}\ntraffic: {demand: [other.rou.xml]}", "not uploaded"),
-        (b"map: {source: map.net.xml}\nplugins: [antigravity]", "plugins: name modules"),
+        (b"map: {source: map.net.xml}\nplugins: [antigravity]", "plugins: its entries name"),
         (b"map: {source: map.net.xml}\nzones: {journal: log}", "zones.journal: an uploaded"),
         (b"map: {source: map.net.xml}\nzones: {simulators: {1: carla}}", "zones.simulators"),
         (b"map: {source: map.net.xml}\nscenario: {name: code.py}", "code.py"),

@@ -188,7 +188,7 @@ def boxes_overlap(
 
 @kernel
 def _overlap_s(apart: float, rate: float, reach: float) -> tuple[float, float]:
-    """Return when two projections start and stop to overlap on one axis, in s; inf, -inf: never.
+    """Return when two projections start and stop overlapping on one axis, in s; inf, -inf: never.
 
     Their centres are `apart` m apart, which changes by `rate` m/s.
     """

@@ -4,8 +4,8 @@
 into `bodies`: compact records with sine and cosine of the heading computed once. Within a cell,
 bodies are in row order; readers must not depend on this order, and break ties by id.
 
-The border cells extend to infinity: they contain everything outside of the grid's area. If worlds
-drive on one of several maps, the area floats: it begins where their vehicles are.
+The border cells extend to infinity: they contain everything outside of the grid's area. If each
+world has one of several maps, the area floats: it begins where the vehicles of the world are.
 """
 
 from __future__ import annotations

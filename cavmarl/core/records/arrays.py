@@ -73,7 +73,7 @@ class TripTables(NamedTuple):
     see_m: float  # distance before a stop line from which drivers check it
     num_fixed: int  # the world writes steps from this index on while it runs
     scripts: Scripts
-    shifts: NDArray[np.int64]  # (W,) steps from each plan to the world's own plan, see `LanePlans`
+    shifts: NDArray[np.int64]  # (W,) row of a world's own plan minus row of the map's plan
     trip_horizon: float = 0.0  # limit of agents' trips, in free-flow times; 0: no limit
     tick_s: float = 0.1
 

@@ -26,7 +26,7 @@ def wrong_changes(told: NDArray[np.float64], lanes: NDArray[np.void]) -> str:
         return "a changed lane has a number that is negative or not finite"
     used = told[told[..., CHANGED] > 0.0]
     if (told[told[..., CHANGED] == 0.0] != 0.0).any():
-        return "a changed lane is not counted"
+        return "an unused row of changed lanes has a number other than 0"
     row = used[:, CHANGED] - 1.0
     if (row != np.floor(row)).any() or (row >= len(lanes)).any():
         return "a changed lane does not exist"

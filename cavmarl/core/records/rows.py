@@ -22,9 +22,9 @@ SIZE_BODIES_M = (
 STEERED = 3  # class of a steered car, in SWEEP rows about the area that it sweeps
 WAIT_SLACK_M = 0.5  # a front this far beyond a waiting position inside a junction still waits there
 MERGES_M = 300.0  # a vehicle this close to a line is watched by vehicles that turn into its lane
-SWEPT_BEYOND_M = 9.0  # how far beyond a junction other drivers may watch a vehicle's rear
+SWEPT_BEYOND_M = 9.0  # other drivers may watch a vehicle until its rear is this far past a junction
 FORK_BEYOND_M = 3.0  # how far beyond a junction paths from one lane can still overlap
-LOST_M = 10.0  # a steered or a caller's vehicle that is farther from its lane counts as gone
+LOST_M = 10.0  # a steered or a caller's vehicle farther from its lane than this is on no lane
 OFF_LANES_M = 1.5  # a scripted vehicle farther from the middle of its lane is off the lanes
 
 

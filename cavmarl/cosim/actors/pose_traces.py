@@ -41,7 +41,7 @@ class PoseTrace:
         name: name of the body.
         vtype: its type; see `ActorOrder`.
         size_m: length, width and height; None: the type's size.
-        samples: samples in the order of arrival; stamps begin at the first row of the file.
+        samples: samples in the order of arrival; stamps count from the earliest time in the file.
         received_s: time at which each sample arrives; ascending.
     """
 
@@ -172,14 +172,14 @@ class _Played:
     trace: PoseTrace
     next: int = 0  # first sample that has not arrived
     actor: ClientActor | None = None
-    refused: int = 0  # steps in which the place of the newest pose was occupied
+    refused: int = 0  # steps with new poses in which the place of the newest was occupied
 
 
 class TracePlayer:
     """Plays traces in an environment, in each episode from its start.
 
-    A body enters in the step of its first pose; if its place is occupied, it enters as soon as the
-    place is free. It leaves after its last pose.
+    A body enters in the step of its first pose; if the place is occupied, it enters with the first
+    later pose whose place is free. It leaves after its last pose.
 
     Args:
         actors: the actors of the environment.
@@ -203,7 +203,7 @@ class TracePlayer:
 
     @property
     def refused(self) -> int:
-        """Number of steps in which a body waited for a free place, in this episode."""
+        """Number of steps with new poses in which a body could not enter, in this episode."""
         return sum(one.refused for one in self._played)
 
     def begin_episode(self) -> None:

@@ -101,7 +101,7 @@ class ImuSensor:
 
 
 class CollisionSensor:
-    """Contacts of the parent with another vehicle, or with something else off the road."""
+    """Contacts of the parent with another vehicle, a walker or a prop."""
 
     kind: ClassVar[int] = 0
 

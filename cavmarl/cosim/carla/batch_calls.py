@@ -56,7 +56,7 @@ def _command(value: Any) -> tuple[int, list[Any]]:
     listed(_command, most=MAX_COMMANDS),
     flag,
     returns=Returns.BARE,
-    note="each command as the call of its name; actor 0 stands for the spawned actor",
+    note="a command works like the call of its name; after a spawn, actor 0 is the spawned actor",
 )
 def apply_batch(
     caller: Caller, session: CarlaSession, commands: Sequence[tuple[int, list[Any]]], do_tick: bool
@@ -65,7 +65,7 @@ def apply_batch(
     if do_tick and session.settings.synchronous:
         try:
             session.tick_for(caller)
-        except CallRefused as problem:  # a command gets the answer that the call would get
+        except CallRefused as problem:  # only the tick is refused; the commands keep their answers
             session.tell(f"{caller.name}: apply_batch: {problem}")
     return answers
 

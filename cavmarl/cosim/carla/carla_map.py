@@ -45,7 +45,7 @@ _STATE_OF_CODE[[SIGNAL_OFF_BLINKING, SIGNAL_OFF]] = OFF
 
 SPAWN_HEIGHT_M = 0.3  # spawn points are this far above the road
 _SPAWN_EVERY_M = 40.0
-_FIRST_SPAWN_M = 15.0  # distance of a spawn point from the start of a longer lane
+_FIRST_SPAWN_M = 15.0  # distance of the first spawn point from the start of a lane over 30 m
 _SHORTEST_M = 12.0  # a shorter lane has no spawn point
 _SIGNAL = re.compile(r"<signal\s([^>]*)>")
 _ATTRIBUTE = re.compile(r'(\w+)="([^"]*)"')

@@ -156,7 +156,8 @@ class CarlaReplay:
         self.end_s = min(last_s, self.begin_s + duration_s) if duration_s > 0.0 else last_s
         if self.begin_s > last_s:
             raise RecordingError(
-                f"{recording.name}: starts at {begin_s:g} s, but lasts {last_s:g} s; start earlier"
+                f"{recording.name}: the replay cannot start at {begin_s:g} s, as the recording "
+                f"lasts {last_s:g} s; start earlier"
             )
         if recording.most_rows > capacity:
             raise RecordingError(

@@ -163,7 +163,7 @@ class CarlaSession:
     def tick_for(self, caller: Caller) -> int:
         """Handle the tick of a client; return the number of the frame that the client waits for.
 
-        Ticks of other clients than the time master are events of the world's `TimeMaster`.
+        Ticks of other clients than the time master are recorded as events of the `TimeMaster`.
 
         Raises CallRefused: another client is the time master, and `other_ticks` is `refuse`.
         """
@@ -328,7 +328,7 @@ class CarlaSession:
             self.forget(one)
 
     def release(self, caller: Caller) -> None:
-        """Give the agents of a client that has left back to the built-in driver."""
+        """Let the built-in driver drive the agents of a client that has left."""
         if caller is self._ticking:
             self._ticking = None
         for agent in caller.agents:

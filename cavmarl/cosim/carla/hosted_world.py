@@ -127,7 +127,7 @@ class HostedWorld:
     @property
     def present_lanes(self) -> NDArray[np.void]:
         """LANE (L,) as they are now, with limits that roadside units and callers have set."""
-        # The last table belongs to the only world; if lanes cannot change, it belongs to the map.
+        # `lanes` has the map's table and, if lanes can change, then the table of the only world.
         lanes: NDArray[np.void] = self.simulation.shards[0].worlds.lanes[-1]
         return lanes
 

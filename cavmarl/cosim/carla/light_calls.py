@@ -50,7 +50,7 @@ _set_time(
     actor_id,
     flag,
     returns=Returns.NOTHING,
-    note="all lights of the group; the client calls freeze_all_traffic_lights",
+    note="all lights of the group; CARLA's client calls freeze_all_traffic_lights instead",
 )
 def freeze_traffic_light(
     caller: Caller, session: CarlaSession, actor: int, is_frozen: bool

@@ -148,7 +148,7 @@ def _beside(
 def _connections(
     network: RoadNetwork, strips: dict[int, _Strip], points: NDArray[np.float64], side: float
 ) -> Iterator[tuple[tuple[int, ...], tuple[int, int]]]:
-    """Yield corners between strips and crosswalks over roads: four vertices, area and flags."""
+    """Yield the corners that join strips, and the crosswalks: four vertices, area and flags."""
     edges = network.edges
     leaving: dict[int, list[int]] = {}
     neighbours: dict[int, set[int]] = {}

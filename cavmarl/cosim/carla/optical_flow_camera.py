@@ -92,7 +92,7 @@ class OpticalFlowCamera(AttachedCamera):
 
 
 def _moved_back(points: Floats, ids: NDArray[np.int64], now: _Bodies, before: _Bodies) -> Floats:
-    """Return where points (n, 3) of bodies were; bodies that were not there have not moved."""
+    """Return where points (n, 3) of bodies were; bodies without a former place count as still."""
     found = points.copy()
     known, then = before.find(ids)
     _, here = now.find(ids[known])

@@ -68,7 +68,7 @@ class SensorContext:
         return -1 if parent is None else parent.vehicle
 
     def hidden_carrier_of(self, actor: CarlaActor) -> int:
-        """Return the vehicle that a camera hides because it is in or above its body, or -1."""
+        """Return the id of the vehicle that a camera in or above it does not show, or -1."""
         parent = self.session.actors.actors.get(actor.parent)
         if parent is None or actor.local is None:
             return -1

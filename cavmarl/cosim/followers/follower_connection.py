@@ -430,7 +430,7 @@ class Reception:
         for line, since in list(self._since.items()):
             if time.monotonic() - since > GREETING_S:
                 self._forget(line)
-                refuse(line, f"has not introduced itself within {GREETING_S:g} s")
+                refuse(line, f"a caller has not introduced itself within {GREETING_S:g} s")
 
     def _forget(self, line: FollowerConnection) -> None:
         del self._since[line]

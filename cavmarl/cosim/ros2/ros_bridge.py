@@ -263,7 +263,7 @@ class RosBridge:
                     kind,
                     self._node.kind_of(topic),
                 )
-        # This node subscribes to the clock itself. Late subscribers also get latched topics.
+        # One subscription to the clock is this node's own. Latched topics are sent in any case.
         self._wanted = frozenset(
             topic
             for topic in self._topics.kinds

@@ -44,8 +44,8 @@ _FEWEST_PAIRS, _LEAST_SHARE = 30, 0.5  # least number of used pairs, and share o
 _DEVIATION_M = 0.08  # standard deviation of a pair, for map and scan
 _CORRELATED = 9.0  # this many pairs count as one, since neighbouring errors are correlated
 _WEAKEST = 1e-3  # share of the best axis's information below which an axis is ignored
-# Minimum deviation along the best axis: errors of scans are correlated, and noise of normals looks
-# like information along the other axes.
+# Minimum deviation along the best axis, and in proportion along weaker axes: errors of scans are
+# correlated, and noise of normals looks like information along weaker axes.
 _LEAST_M = 0.1
 _BIAS_M, _BIAS_DRIFT_M = 3.0, 0.02  # deviation of the fixes' bias, and its drift per second
 _SURE_M = 0.5  # standard deviation below which a scan is tried only at the estimated position

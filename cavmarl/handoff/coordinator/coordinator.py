@@ -110,7 +110,7 @@ class Coordinator(ABC):
     @abstractmethod
     def begin(
         self,
-        check_all: bool,  # whether rows have changed since ghosts were renewed: check all rows
+        check_all: bool,  # whether to check all rows: some have changed since ghosts were renewed
         inputs: bytes = b"",  # digest of the actions
     ) -> None:
         """Decide the owners for the next tick, and move rows between owners.

@@ -60,7 +60,7 @@ class HandoffLog:
 
     def hand_over(
         self,
-        check_all: bool,  # whether rows have changed since ghosts were renewed: check all rows
+        check_all: bool,  # whether to check all rows: some have changed since ghosts were renewed
         vehicles: int,  # expected number of vehicles
         newborn: Sequence[Birth],  # entered since the last BEGIN; these vehicles keep their owner
     ) -> int:  # number of changes

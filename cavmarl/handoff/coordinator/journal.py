@@ -122,7 +122,7 @@ class Journal:
         # is dropped
         resume: bool = False,
         # whether to overwrite an existing file; the process that writes, possibly a fork of this
-        # one, truncates the file with its first line or with `go_to`
+        # one, truncates the file when it writes its first line, or in `go_to`
         anew: bool = False,
         # where the lines are when an append returns; "flush": in the operating system, so that they
         # survive a crash of the process; "fsync": on disk, so that they survive a power failure

@@ -6,9 +6,9 @@ The new owner copies the old owner's row. The call that advances a shard replace
 decisions and the records are the same as with messages if no message is lost.
 
 The table of owners is updated from time to time, and on request. Records are made only if they are
-read. A journal receives all records immediately. Watchers receive the records of ticks in which a
-vehicle has entered, left or changed its owner, when the table is updated. Callers that need changes
-in the same tick set `foretell`.
+read. A journal receives all records immediately. When the table is updated, watchers receive the
+records of ticks in which a vehicle has entered, left or changed its owner. Callers that need
+changes in the same tick set `foretell`.
 """
 
 from __future__ import annotations

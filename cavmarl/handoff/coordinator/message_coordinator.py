@@ -3,7 +3,8 @@
 All zones are in this process, but another simulator can refuse a vehicle, be late or die. So each
 zone has an endpoint of the ownership protocol, and all messages are sent. A vehicle that has
 crossed a border is offered with its state (PREPARE). Its new zone accepts or refuses it (ACK,
-NACK). The coordinator decides (BEGIN, STEP). Both zones confirm and release it (DONE, COMMIT).
+NACK). The coordinator decides (BEGIN, STEP). The new zone confirms the vehicle (DONE), and the
+coordinator commits the tick (COMMIT).
 """
 
 from __future__ import annotations
@@ -111,7 +112,7 @@ class MessageCoordinator(Coordinator):
         return self._is_open
 
     def reset(self) -> None:
-        """Begin an episode without vehicles. Simulators run the zones again that they have lost."""
+        """Begin an episode without vehicles. Simulators get back the zones that they have lost."""
         directory = self._directory
         self.resume()
         self._is_open = False

@@ -80,7 +80,7 @@ def check_rig(zone: int, options: Mapping[str, str], rig: Mapping[str, MountedCo
     """With `frames=backend`, check that CARLA can give the frames of a rig.
 
     Raises:
-        ConfigError: the rig has a `bev_grid`, for which CARLA has no frames, a sensor with noise or
+        ConfigError: the rig has a `bev_grid` (CARLA has no frames for it), a sensor with noise or
             bias whose frames come from CARLA, or a radar with a wider field of view than CARLA's.
     """
     if not gives_frames(options):

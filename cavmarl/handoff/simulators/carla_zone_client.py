@@ -181,7 +181,7 @@ class Zone:
         for row in rows:
             vehicle = int(row[0])
             if vehicle not in self._cars and (reason := self._place(vehicle, row)):
-                raise ValueError(f"vehicle {vehicle}, which CARLA had accepted: {reason}")
+                raise ValueError(f"CARLA refuses vehicle {vehicle}, which it accepted: {reason}")
             car = self._cars[vehicle]
             car.is_owned, car.left = True, 0 if car.is_seen else PLACED_TICKS
             car.actor.set_simulate_physics(True)

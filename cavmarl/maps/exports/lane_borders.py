@@ -64,7 +64,7 @@ class LaneBorders:
         return True
 
     def _meet(self, internal: NDArray[np.bool_]) -> None:
-        """Move joined ends to their mean, if possible outside of junctions."""
+        """Move joined ends to their mean; ends inside junctions count only if all are inside."""
         ends = np.array(
             [[[border[0], border[-1]] for border in borders] for borders in self.places]
         ).reshape(-1, 3)

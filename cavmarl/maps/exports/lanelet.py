@@ -41,8 +41,9 @@ def write_lanelet2(network: RoadNetwork, target: Path, is_local: bool = False) -
 
     Lanelets of lanes that lead into each other share end points, and lanelets of neighbours share a
     border, so that routes are connected. A link with a signal has a traffic light, whose id is
-    `FIRST_LIGHT` plus the row of the link. A link that gives way to others has a right of way,
-    `FIRST_RIGHT` plus its row. Lanes without cars have `participant:vehicle` = no.
+    `FIRST_LIGHT` plus the row of the link. A link that gives way to others has a right-of-way
+    element with the id `FIRST_RIGHT` plus the row. Lanes without cars have `participant:vehicle` =
+    no.
 
     `is_local`: the file is read by `local_x` and `local_y`, so the map needs no projection.
 

@@ -163,7 +163,7 @@ def _section(outer_m: Points, height_m: Points) -> tuple[float | None, float | N
 def _motion(
     stations: _Stations, at: NDArray[np.int64], offset_m: Points, heights_m: Points
 ) -> Points | None:
-    """Return the least-squares motion in the plane, raised by minus the median height offset."""
+    """Return the least-squares motion in the plane; its z is minus the median height offset."""
     if len(at) < _FEWEST_STATIONS:
         return None
     middle = np.median(offset_m)

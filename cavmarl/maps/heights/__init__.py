@@ -1,3 +1,3 @@
-"""Heights of a map: terrain models are read, and networks get their heights without steps."""
+"""Heights of a map: reads terrain models, and gives networks heights without vertical jumps."""
 
 from __future__ import annotations

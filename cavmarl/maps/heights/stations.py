@@ -14,8 +14,8 @@ from cavmarl.maps.heights.profile_graph import ProfileGraph
 from cavmarl.maps.net_document import DocumentLane, NetDocument, Points
 
 STEP_M = 1.0
-# The place beside a place is searched on the neighbouring lane, up to this many places away from
-# the place at the same share of the lane.
+# The neighbour of a place on the lane beside it is the nearest place among those up to this many
+# places before and after the same share of that lane.
 _BESIDE = 40
 _OFF_M = 0.01  # maximum error of written heights
 

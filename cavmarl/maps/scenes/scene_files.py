@@ -367,7 +367,7 @@ def _check_size(tracks: int, length: int) -> None:
     if tracks > MOST_TRACKS or tracks * length > MOST_SAMPLES:
         raise MapError(
             f"{tracks} tracks of {length} samples: must be at most {MOST_TRACKS} tracks, and "
-            f"{MOST_SAMPLES} samples of all together; cut the scene into parts"
+            f"{MOST_SAMPLES} samples in total; cut the scene into parts"
         )
 
 

@@ -85,7 +85,7 @@ class NodeFrame(NamedTuple):
         `is_known`: whether its sender has sent a frame of this generation before.
 
         Raises:
-            MessageError: the node cannot have sent the frame in an earlier generation.
+            MessageError: the generation of the frame is later, or is earlier despite `is_known`.
         """
         if self.number == generation:
             return True

@@ -59,7 +59,7 @@ class _World:
         self.answered: set[tuple[int, int]] = set()
         self.refused: set[tuple[int, int]] = set()  # refused offers, a part of `answered`
         self.has_stepped = False  # whether each zone has received a STEP in the current episode
-        self.has_begun = False  # whether the first reset is done; before, rows have no episode
+        self.has_begun = False  # whether the first reset is done; before it, rows are of no episode
         self.on_record = OwnersOnRecord(zones, limits) if is_checked else None
 
     def check_owned(self, w: int, reports: Sequence[Report]) -> None:
@@ -307,9 +307,8 @@ class NodeCoordinator:
         is_usual = self._has_recovered or 2 * sum(began.values()) > len(began)
         for number, has_begun in began.items():
             if has_begun != is_usual:
-                raise LinkLostError(
-                    number, MessageError(f"it wrongly reports: an episode has begun: {has_begun}")
-                )
+                what = "a" if has_begun else "no"
+                raise LinkLostError(number, MessageError(f"it wrongly reports {what} new episode"))
 
     def _check_owned(self, w: int, world: _World, reports: Sequence[Report]) -> None:
         """Compare the vehicles that each zone owns according to its rows with the records.
@@ -411,7 +410,7 @@ class NodeCoordinator:
         ]
 
     def lease(self, messages: Mapping[int, bytes], ticks: int) -> None:
-        """Send leases that `begin` returned; `ticks`: 0 for leases of 0 ticks; else above 0."""
+        """Send leases, as `begin` returns them; `ticks`: 0 if they have 0 ticks, else any other."""
         for node, data in messages.items():
             self._links.send(node, FrameKind.LEASE, ticks, [data])
 

@@ -155,7 +155,7 @@ class NodeGroups(CommandedWorlds):
         return {k: pid for k, group in enumerate(self.groups) for pid in group.pool.pids}
 
     def _seen(self) -> LoadSnapshot:
-        """Add the costs of worlds before a round of balancing; nodes count as idle."""
+        """Add new costs of worlds to `_spent_s`, for a round of balancing; nodes count as idle."""
         costs = self._run_jobs(NodeWorlds.world_costs_s, self.groups, _ignore)
         self._spent_s[:, 0] += np.concatenate(costs)
         return idle_snapshot(len(self.groups))

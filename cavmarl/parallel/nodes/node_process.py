@@ -99,7 +99,7 @@ class NodeProgram:
         self._synchronized: set[int] = set()  # nodes whose SYNC of this generation has arrived
         # world, vehicle and zone of each offer that was answered recently
         self._answered: list[tuple[int, int, int]] = []
-        # node → fault in one of its frames, kept for the next report: earlier reports may be void
+        # node → fault in one of its frames, repeated in later reports: earlier ones may be void
         self._faults: dict[int, str] = {}
         self._witness: int | None = None  # node that claims that a recovery is ordered
         self._actions: deque[NodeFrame] = deque()  # forwarded actions
@@ -322,7 +322,7 @@ class NodeProgram:
         self._worlds.simulation.zones.set_zones(partition)
         self._host(zones, order["runs"], order["hostings"], frame.number)
         state, mine = order["state"], zones[self._number]
-        if order["begins"]:  # the SYNC that follows the replica confirms its arrival
+        if order["begins"]:  # when the SYNC below arrives, the replica has arrived, too
             self._peers.drop_foreign_rows(self._worlds.simulation.everywhere)
             saved = self._replicas.keep(state, self._living)
         for node in others:

@@ -29,6 +29,7 @@ END_S = 5.0  # time for nodes to end
 
 
 Route: TypeAlias = Callable[[Place], Place]
+"""Maps a place to the place to call instead, for example a forwarder that injects faults."""
 
 
 def straight(place: Place) -> Place:

@@ -183,7 +183,7 @@ class NodeWorlds(CommandedWorlds):
         return answer_of(self._network, read_request(data, len(self.arrays.mask), latency))
 
     def _seen(self) -> LoadSnapshot:
-        """Add the costs of zones before a round of balancing; return how busy nodes are.
+        """Add new costs of zones to `_spent_s` for a round of balancing; return how busy nodes are.
 
         Nodes that are not watched, or are lost, count as idle.
         """

@@ -120,7 +120,7 @@ class RowStream:
 
         Args:
             side: buffer of the rows, 0 or 1, whose ghosts are sent.
-            passing: vehicles that leave through the departure queue.
+            passing: vehicles that leave, in the arrays of the departure queue.
         """
         sent = self._sent
         before = len(sent.before.words)
@@ -165,7 +165,7 @@ class RowStream:
 
 
 def passing_of(departures: DepartureQueue) -> Passing:
-    """Return the vehicles that leave through a departure queue, as views."""
+    """Return the vehicles that leave, from the arrays of a departure queue, as views."""
     return Passing(words_of(departures.passing), departures.num_passing, departures.counts)
 
 

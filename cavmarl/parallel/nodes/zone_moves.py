@@ -54,8 +54,8 @@ def read_order(data: memoryview, zones: int) -> dict[str, Any]:
 
 
 _LOST_STATE = (
-    "The state of these zones was only there: make the environment again, which begins new "
-    "episodes; the log says why each node was lost"
+    "Only the lost nodes had the state of these zones: make the environment again, which begins "
+    "new episodes; the log says why each node was lost"
 )
 
 

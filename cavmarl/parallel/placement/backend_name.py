@@ -26,7 +26,7 @@ class BackendName:
 
     Attributes:
         kind: one of `OWN`, or the name of a registered backend.
-        count: number of processes or nodes; None: no number given, or as many as are useful.
+        count: number of processes or nodes; None: no number given (`ray`: as many as are useful).
         address: host and port to listen on for nodes started by hand, or MPI, whose other ranks are
             the nodes.
     """

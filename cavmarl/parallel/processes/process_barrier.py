@@ -33,7 +33,7 @@ NUMBER, ASLEEP = 0, 1  # words that this module uses; callers define the other w
 
 SHORT_S = 20e-6  # a side polls for this time before it sleeps
 LONG_S = 200e-6  # a side polls for this time if its previous wait was not longer
-LONG_WORK_S = 500e-6  # after a longer wait, a side sleeps; after more work, it polls `SHORT_S`
+LONG_WORK_S = 500e-6  # after longer work, it polls for `SHORT_S`; after a longer wait, not at all
 PAUSES = 4  # polls before a side yields the core
 ROUNDS = 16  # yields before a side reads the clock
 ALONE_S = 300e-6  # a side with a core of its own polls without yielding for this time

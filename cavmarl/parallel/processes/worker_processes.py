@@ -109,7 +109,7 @@ class WorkerProcesses:
         head: tuple[int, ...],  # words of the command, from TASK to COMMITTED
         stale: Sequence[bool],  # for each worker, whether its memory differs from its image
         mail: bytes | None,  # payload
-        # whether this side sleeps at once, since a worker may wait for its core
+        # whether this side sleeps at once, so that its core is free for a worker
         sleeps: bool = False,
     ) -> None:
         """Send the next command; `sleep` detects dead workers.

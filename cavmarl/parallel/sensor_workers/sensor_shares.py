@@ -59,7 +59,7 @@ class Shares:
 
     @property
     def divided(self) -> dict[int, list[tuple[int, tuple[int, int]]]]:
-        """Worker and lines of each part, for each sensor that is divided equally for all agents.
+        """Worker and lines of each part, for sensors divided in the same way for all agents.
 
         Other sensors are left out: measured times of whole frames, or of different divisions,
         cannot be attributed to lines.

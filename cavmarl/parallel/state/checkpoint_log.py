@@ -1,8 +1,8 @@
 """`CheckpointLog`: an occasional image of worlds, and the commands of the steps after it.
 
-Writing an image takes a tenth of the time of a step; for ten thousand vehicles, it takes half the
-time of a tick that several workers share. The state and the commands determine a step, so a
-successor may resume from an older image and repeat the steps after it.
+Writing an image takes a tenth of the time of a step. If several workers run a world of ten thousand
+vehicles together, it takes half the time of a tick. The state and the commands determine a step, so
+a successor may resume from an older image and repeat the steps after it.
 """
 
 from __future__ import annotations

@@ -64,7 +64,7 @@ class PooledWorlds(CommandedWorlds):
                 config.zones,
                 "with workers.balance_steps and zones.repartition_steps: worlds move between "
                 "workers, but each worker repartitions its own worlds",
-                "leave workers.balance_steps or zones.repartition_steps 0",
+                "set workers.balance_steps or zones.repartition_steps to 0",
             )
         _warn_of_few_cores(workers)
         if not compiled_before():

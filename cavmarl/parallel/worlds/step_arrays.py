@@ -36,7 +36,7 @@ class StepArrays(NamedTuple):
     """
 
     observations: NDArray[np.float32]  # (W, A, D) for the next action
-    final_observations: NDArray[np.float32]  # (W, A, D) last of agents and episodes that ended
+    final_observations: NDArray[np.float32]  # (W, A, D) last ones of ended agents and episodes
     rewards: NDArray[np.float32]  # (W, A)
     terminations: NDArray[np.bool_]  # (W, A) the agent's vehicle has left the world
     # (W, A) the horizon of the episode, or of the trip (the vehicle then leaves), was reached
@@ -68,7 +68,7 @@ class StepArrays(NamedTuple):
     signal_states: NDArray[np.int64]  # (W, S, HELD)
     signal_history: NDArray[np.int64]  # (W, N, HISTORY)
     signal_loops: NDArray[np.int64]  # (W, N, 2, READINGS)
-    final_signal_observations: NDArray[np.float32]  # (W, S, D) last of episodes that ended
+    final_signal_observations: NDArray[np.float32]  # (W, S, D) last ones of ended episodes
     suggested: NDArray[np.float64]  # (W, A, 2) actions of the built-in driver
     states: NDArray[np.float32]  # (W, size) global states at the last request
     frames: Frames  # frames of mounted sensors

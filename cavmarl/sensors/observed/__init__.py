@@ -104,7 +104,7 @@ def carried_from(config: SensorsConfig) -> int:
 
 
 def largest_radius_m(types: NDArray[np.void]) -> float:
-    """Return half the diagonal of the largest body, in m: the bound from any centre to a corner.
+    """Return half the diagonal of the largest body, in m: no corner is farther from its centre.
 
     Args:
         types: VTYPE (num_types,), `TripTables.types`: the types of agents and of all other

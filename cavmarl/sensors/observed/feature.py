@@ -118,7 +118,7 @@ class Sensor:
     # shape of the sensor's part of a Dict observation; -1 stands for the number of features
     shape: Callable[[SensorsConfig], tuple[int, ...]] = _flat
     dtype: Callable[[SensorsConfig], DTypeLike] = _float32  # dtype of that part
-    # arguments of the kernel, for optional sensors, which `observe_optional` writes
+    # arguments of the kernel `observe_optional` for this sensor; None: it does not write the sensor
     settings: Callable[[SensorSetup], tuple[Any, ...]] | None = None
     # whether the reach is measured to the nearest part of a body, not to its centre
     sees_bodies: bool = False

@@ -11,7 +11,7 @@ _SPEED = f"{SPEED_SCALE:g} m/s"
 
 
 def features(config: SensorsConfig) -> list[Feature]:
-    """List three features per step, latest first; earlier steps repeat the vehicle's first."""
+    """List three features per step, latest step first; the first step fills all steps before it."""
     rows = (
         ("throttle", "commanded acceleration", "10 m/s²"),
         ("steering", "front wheel angle, left positive", "pi/4 rad"),

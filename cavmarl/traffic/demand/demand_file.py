@@ -190,8 +190,9 @@ class DemandFile:
         """Return this demand, with a later begin if no vehicle departs within an episode.
 
         If the files state no begin, and no vehicle departs in the first `horizon_s`, the demand
-        begins at its first departure, rounded down to whole seconds. The report states this, and
-        also if no vehicle departs within an episode.
+        begins at its first departure, rounded down to whole seconds. The report states this. If
+        still no vehicle departs within an episode, the demand does not change, and the report
+        states that.
         """
         if self._departs_within(horizon_s):
             return self

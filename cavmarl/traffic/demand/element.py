@@ -48,9 +48,9 @@ def late_begin(begin_s: float, horizon_s: float, first_ms: int, stays: bool) -> 
     `first_ms`: time of the first departure. `stays`: whether the episode begins at `begin_s`
     nevertheless, instead of at the first departure.
     """
-    none = f"no vehicle departs in the {horizon_s:g} s from {begin_s:g} s"
+    none = f"no vehicle departs from {begin_s:g} s to {begin_s + horizon_s:g} s"
     if stays:
-        return f"{none}, only from {first_ms // 1000} s: change horizon_s, or begin in the .sumocfg"
+        return f"{none}, only from {first_ms // 1000} s: change horizon_s, or the .sumocfg's begin"
     return f"the demand begins at {first_ms // 1000} s, as {none}"
 
 

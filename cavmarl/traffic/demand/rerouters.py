@@ -18,7 +18,7 @@ from cavmarl.traffic.demand.map_index import MapIndex
 from cavmarl.traffic.demand.route_records import RouteTable
 
 MAX_INTERVALS = 30_000  # each interval has its own random numbers
-MAX_RULES = 300_000  # number of intervals times edges
+MAX_RULES = 300_000  # each pair of an interval and an edge is a rule
 KEEP_DESTINATION = -1  # in place of an EDGE row
 _ACTED_ON = ("closingReroute", "destProbReroute", "routeProbReroute")
 _NOT_MODELLED = ("timeThreshold", "radius", "file")
@@ -79,7 +79,7 @@ def read_rerouters(
     use roads.
 
     Raises DemandError: an edge, route, type, time or probability is invalid; CapacityError: there
-    are more than `MAX_INTERVALS` intervals, or more than `MAX_RULES` intervals times edges.
+    are more than `MAX_INTERVALS` intervals, or more than `MAX_RULES` pairs of interval and edge.
     """
     reader = _Reader(index, routes, type_ids, known_types, report)
     for element in elements:
@@ -154,8 +154,8 @@ class _Reader:
             raise interval.error("ends before it begins", "let end be after begin")
         if len(self._types) == MAX_INTERVALS or len(self._rules) + len(edges) > MAX_RULES:
             raise interval.error(
-                f"is beyond {MAX_INTERVALS} intervals of rerouters, or {MAX_RULES} intervals times "
-                "edges",
+                f"exceeds {MAX_INTERVALS} intervals of all rerouters, or {MAX_RULES} pairs of "
+                "interval and edge",
                 "use fewer intervals or edges",
                 CapacityError,
             )

@@ -181,7 +181,10 @@ class Resolver:
         return some
 
     def _gap(self, route: int, permissions: int) -> str | None:
-        """Return why a class cannot drive a route, or None; if `_skip`, also search trips."""
+        """Return why a class cannot drive a route, or None if it can.
+
+        If `_skip` is set, routes are also searched for trips, to find those without a route.
+        """
         edges, exact = self.routes.edges(route), self.routes.exact(route)
         gap = self._index.gap(edges, exact, permissions)
         if gap is None and self._skip and not exact:

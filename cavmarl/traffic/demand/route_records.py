@@ -166,7 +166,8 @@ class StopReader:
 
 MAX_ROUTE_EDGES = 50_000_000  # maximum total number of edges of all routes
 
-# Attributes that name a place, not an edge. As in SUMO, `from` and `to` override the first tuple.
+# Attributes that name a place, not an edge. As in SUMO, `from` and `to` override the attributes in
+# the first tuple.
 _REPLACED_BY_EDGES = ("Junction", "Taz")
 _COORDINATES = ("XY", "LonLat")
 

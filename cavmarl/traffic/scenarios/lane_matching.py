@@ -22,7 +22,7 @@ class LanePlace(NamedTuple):
 
 
 class LaneMatcher:
-    """Finds the lanes for cars below poses."""
+    """Finds the car lanes on which vehicles with given poses drive."""
 
     def __init__(self, network: RoadNetwork) -> None:
         self._network = network

@@ -86,9 +86,9 @@ def read_input(demand: Sequence[Path]) -> SumoInput:
 
 
 def begun(given: SumoInput, horizon_s: float) -> SumoInput:
-    """Return an input with a begin from which vehicles depart in an episode; see `DemandFile`.
+    """Return the input, with a later begin if no vehicle departs within an episode.
 
-    Files that cannot be read are skipped: SUMO reports the error.
+    See `DemandFile.begun`. Files that cannot be read are skipped: SUMO reports the error.
     """
     firsts: list[tuple[int, str]] = []
     begin_ms = round(1000.0 * given.begin_s)
@@ -165,7 +165,7 @@ def without_outputs(path: Path, folder: Path) -> Path:
 def _may_write(path: Path, changed_ns: int) -> bool:
     content = read_bytes(path)
     encoding = declared_encoding(content).lower() or "utf-8"
-    if encoding not in _ASCII_BELOW or 0 in content[:4]:  # UTF-16 and UTF-32 begin with a zero byte
+    if encoding not in _ASCII_BELOW or 0 in content[:4]:  # zero bytes: UTF-16 or UTF-32
         raise ConfigError(f"{path}: encoded as {encoding} or UTF-16; save it as UTF-8")
     if b"<![CDATA[" not in content:  # CDATA may contain text that looks like a comment
         content = _COMMENT.sub(b"", content)  # netconvert writes its options to a comment

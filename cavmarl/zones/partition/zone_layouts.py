@@ -140,8 +140,8 @@ def _bisected(area: _Area, rect: Rect, samples: Floats | None, count: int) -> li
     else:
         raise ConfigError(
             f"the map cannot hold this many zones: no cut divides x {rect[0]:.2f} to "
-            f"{rect[2]:.2f}, y {rect[1]:.2f} to {rect[3]:.2f} into {count} zones with a share of "
-            f"the weight and sides of {MIN_SIDE_M:g} m; use fewer zones"
+            f"{rect[2]:.2f}, y {rect[1]:.2f} to {rect[3]:.2f} into {count} zones, each with a part "
+            f"of the weight and with sides of at least {MIN_SIDE_M:g} m; use fewer zones"
         )
     cut = _quiet_cut(area, rect, axis, window)
     low, high = list(rect), list(rect)

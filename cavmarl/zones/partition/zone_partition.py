@@ -106,7 +106,7 @@ class ZonePartition:
 
     @cached_property
     def content_hash(self) -> str:
-        """SHA-256, in hex, of the zones of all positions, for manifests."""
+        """SHA-256, in hex, of the rectangles with the rim at infinity, for manifests."""
         sides = [[float(side).hex() for side in rect] for rect in self.reaching]
         return hashlib.sha256(json.dumps({"cavmarl.zones": sides}).encode()).hexdigest()
 

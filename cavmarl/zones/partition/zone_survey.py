@@ -36,9 +36,10 @@ def lane_samples(network: RoadNetwork) -> Floats:
 
 
 def junction_boxes(network: RoadNetwork) -> Floats:
-    """Return bounding boxes (n, 4) of junctions with crossing or merging lanes, with lane widths.
+    """Return bounding boxes (n, 4) of the junctions where lanes cross or merge.
 
-    A box is min_x, min_y, max_x, max_y in metres. Boxes are in the order of the JUNCTION rows.
+    A box is min_x, min_y, max_x, max_y in metres, and includes the widths of the lanes. Boxes are
+    in the order of the JUNCTION rows.
     """
     crossing = np.unique(network.links["junction"][network.links["num_conflicts"] > 0])
     inside = network.lanes[network.lanes["internal"]]

@@ -301,7 +301,7 @@ def test_other_files_are_refused(own_session: CarlaSession, folder: Path) -> Non
     with pytest.raises(RuntimeError, match="half is being recorded; call stop_recorder first"):
         call("show_recorder_file_info", "half", False)
     call("stop_recorder")
-    with pytest.raises(RuntimeError, match=r"half: starts at 5 s, but lasts 0\.05 s"):
+    with pytest.raises(RuntimeError, match=r"at 5 s, as the recording lasts 0\.05 s"):
         call("replay_file", "half", 5.0, 0.0, 0, False)
     actors = folder / "half" / ACTORS_FILE
     lines = actors.read_text().splitlines()

@@ -168,7 +168,7 @@ def test_a_demand_without_early_departures_begins_with_its_first_departure(read:
     file = read("", LATE).begun(60.0)
     assert (file.begin_ms, len(file.draw(0, 25260.0))) == (25_200_000, 6)
     ((what, tally),) = file.report.tolerated.items()
-    assert what == "the demand begins at 25200 s, as no vehicle departs in the 60 s from 0 s"
+    assert what == "the demand begins at 25200 s, as no vehicle departs from 0 s to 60 s"
     assert tally.first.endswith("x.rou.xml, line 1")
     assert read("", LATE).begun(25300.0).begin_ms == 0, "a vehicle departs within the horizon"
     random = LATE.replace('number="6"', 'period="exp(0.1)"')
@@ -180,7 +180,7 @@ def test_a_demand_without_departures_is_reported(read: Read, option: str) -> Non
     file = read(option, LATE).begun(60.0)
     assert file.begin_ms == 0
     (what,) = file.report.tolerated
-    assert what.startswith("no vehicle departs in the 60 s from 0 s, only from 25200 s: change")
+    assert what.startswith("no vehicle departs from 0 s to 60 s, only from 25200 s: change")
 
 
 def test_a_begin_of_the_configuration_is_kept(read: Read) -> None:
@@ -193,7 +193,7 @@ def test_a_begin_of_the_configuration_is_kept(read: Read) -> None:
     ("option", "begin_s", "words"),
     [
         ("", 25_200.0, "the demand begins at 25200 s, as no vehicle"),
-        ('<begin value="0"/>', 0.0, "no vehicle departs in the 60 s from 0 s, only from 25200 s"),
+        ('<begin value="0"/>', 0.0, "no vehicle departs from 0 s to 60 s, only from 25200 s"),
         ('<begin value="25190"/>', 25_190.0, None),
     ],
 )

@@ -32,7 +32,7 @@ class Parameters:
     turn_mps: float = setting(3.0, 1.0, 4.0, "m/s", "speed of the turning car")
     pause_s: float = setting(3.0, 1.0, 20.0, "s", "pause between two parts of the turn")
     lead_s: float = setting(
-        0.5, 0.0, 2.0, "s", "time by which the car is in the lane before an agent at constant speed"
+        0.5, 0.0, 2.0, "s", "time from blocking the lane to an agent's arrival at constant speed"
     )
 
 

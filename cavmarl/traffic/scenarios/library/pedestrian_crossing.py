@@ -31,7 +31,7 @@ class Parameters:
     speed_mps: float = setting(8.0, 3.0, 14.0, "m/s", "speed of the agent when it starts")
     walk_mps: float = setting(1.4, 0.5, 3.0, "m/s", "speed of the pedestrian")
     lead_s: float = setting(
-        0.0, -0.5, 2.0, "s", "time by which a pedestrian arrives before an agent at constant speed"
+        0.0, -0.5, 2.0, "s", "time from the pedestrian's arrival to an agent's at constant speed"
     )
     occluded: bool = switch(False, "a parked van hides the pedestrian")
 

@@ -21,7 +21,7 @@ NEEDS = (
 FAR_M = 40.0  # initial distance from the agent to the junction
 INTO_M = 50.0  # distance from the start of the closed road to the vans
 ROAD_M = INTO_M + FREE_M + 10.0
-NEAR_M = 35.0  # the time until the vans leave starts at this distance of the agent
+NEAR_M = 35.0  # distance from the agent to the vans at which the time until they leave starts
 MARGIN_M = 30.0  # margin around the scene that has no other vehicles at the start
 
 

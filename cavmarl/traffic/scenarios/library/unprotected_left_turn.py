@@ -27,7 +27,7 @@ class Parameters:
     gap_s: float = setting(1.5, 1.0, 3.0, "s", "time between the centres of oncoming cars")
     cars: float = setting(3, 1, 6, "", "number of oncoming cars")
     lead_s: float = setting(
-        0.0, -0.4, 0.4, "s", "time by which the first car arrives before an agent at constant speed"
+        0.0, -0.4, 0.4, "s", "time from the first car's arrival to an agent's at constant speed"
     )
 
 
