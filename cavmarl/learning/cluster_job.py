@@ -104,7 +104,7 @@ class TrainingJob:
         if _child is not None:
             os.kill(_child.pid, signal.SIGTERM)
             until = time.monotonic() + SAVE_S
-            # The method of `subprocess` that waits would need a lock that the interrupted call may hold.
+            # The methods of `subprocess` need a lock, which the interrupted call may hold.
             while os.waitid(os.P_PID, _child.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is None:
                 if time.monotonic() > until:
                     os.kill(_child.pid, signal.SIGKILL)
