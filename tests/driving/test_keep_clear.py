@@ -26,7 +26,11 @@ from cavmarl.evaluate.traffic.native_side import idle_commands, make_world
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import make_plans
 from cavmarl.roads.sumo_net.reader import read_network
-from tests.support.narrow_places import signal_pair, turning_pair
+from tests.support.narrow_places import (
+    signal_pair,
+    signals_with_a_junction_between,
+    turning_pair,
+)
 from tests.support.traffic import on_lane, scratch, travel_by
 
 
@@ -170,6 +174,39 @@ def test_a_vehicle_does_not_enter_a_too_short_road_at_red_or_yellow(
 ) -> None:
     # The vehicle is too long to wait on that road. At green, it does not have to wait there.
     assert is_blocked(ahead(tmp_path, light, apart_m=14.0)) == blocked
+
+
+@pytest.mark.parametrize("is_crossed", [True, False])
+def test_a_path_over_a_junction_that_no_path_meets_counts_as_room(
+    tmp_path: Path, is_crossed: bool
+) -> None:
+    # Between the lines of two signals there are 4.8 m of road, and a path of 24 m over a junction.
+    network = read_network(signals_with_a_junction_between(tmp_path, is_crossed))
+    goal = network.edge_ids.index("jn")
+    travel = travel_by(make_plans(network, [goal]))
+    (link,) = np.flatnonzero(
+        (network.links["from_lane"] == network.lane_ids.index("sj_0"))
+        & (network.links["to_lane"] == network.lane_ids.index("jm_0"))
+    )
+    (last,) = np.flatnonzero(
+        (network.links["from_lane"] == network.lane_ids.index("mj_0"))
+        & (network.links["to_lane"] == network.lane_ids.index("jn_0"))
+    )
+    table = on_lane(network, network.lane_ids.index("sj_0"), 280.0, travel, speed=8.0)
+    room = scratch(network, 1)
+    index_lanes(network.arrays, travel, table, 1, room)
+    phase = network.programs["first_phase"][network.signals["program"]].astype(np.int32)
+    place = network.signals[network.links[last]["signal"]]
+    program = network.programs[place["program"]]
+    is_blocked_at = {}
+    for at in range(program["num_phases"]):
+        row = program["first_phase"] + at
+        letter = network.phases["first_state"][row] + network.links[last]["signal_index"]
+        phase[network.links[last]["signal"]] = row
+        is_blocked_at[int(network.phase_states[letter])] = exit_blocked(
+            network.arrays, travel, table, table[0], int(link), int(table[0]["way"]), phase, room
+        )
+    assert is_blocked_at[SIGNAL_RED] == is_crossed
 
 
 def test_a_connection_can_allow_vehicles_to_block_the_junction(tmp_path: Path) -> None:

@@ -50,6 +50,18 @@ PAIR_DEMAND = """<routes>
 <flow id="we" from="wj1" to="je1" begin="0" end="900" vehsPerHour="150"/>
 <flow id="ew" from="ej2" to="jw2" begin="0" end="900" vehsPerHour="150"/></routes>"""
 
+# Two signals, and between them a junction with a path of 24 m between lanes of 4 m and 0.8 m.
+BETWEEN_NODES = """<nodes><node id="s" x="0" y="-300"/><node id="n" x="0" y="340"/>
+<node id="w1" x="-100" y="0"/><node id="e1" x="100" y="0"/><node id="w2" x="-100" y="40"/>
+<node id="e2" x="100" y="40"/><node id="w3" x="-100" y="20"/><node id="e3" x="100" y="20"/>
+<node id="j1" x="0" y="0" type="traffic_light"/><node id="j2" x="0" y="40" type="traffic_light"/>
+<node id="m" x="0" y="20" type="priority" radius="12"/></nodes>"""
+BETWEEN_EDGES = """<edges><edge id="sj" from="s" to="j1"/><edge id="jm" from="j1" to="m"/>
+<edge id="mj" from="m" to="j2"/><edge id="jn" from="j2" to="n"/><edge id="wj1" from="w1" to="j1"/>
+<edge id="je1" from="j1" to="e1"/><edge id="wj2" from="w2" to="j2"/>
+<edge id="je2" from="j2" to="e2"/>{crossing}</edges>"""
+CROSSING_EDGES = '<edge id="wm" from="w3" to="m"/><edge id="me" from="m" to="e3"/>'
+
 TURNS_NODES = """<nodes><node id="w" x="-200" y="0"/><node id="a" x="0" y="0" type="priority"/>
 <node id="b" x="11" y="0" type="priority"/><node id="e" x="211" y="0"/></nodes>"""
 TURNS_EDGES = """<edges><edge id="wa" from="w" to="a" priority="2"/>
@@ -95,6 +107,12 @@ def signal_pair(
     """
     nodes = PAIR_NODES.format(apart=apart_m, north=apart_m + 300.0, second=second)
     return _made(folder, nodes, PAIR_EDGES, PAIR_CONNECTIONS, PAIR_DEMAND)
+
+
+def signals_with_a_junction_between(folder: Path, is_crossed: bool) -> Path:
+    """Make two crossings with signals, and a junction between them that a road may cross."""
+    edges = BETWEEN_EDGES.format(crossing=CROSSING_EDGES if is_crossed else "")
+    return _made(folder, BETWEEN_NODES, edges, "<connections/>", "<routes/>")[0]
 
 
 def turning_pair(folder: Path) -> tuple[Path, Path]:

@@ -182,6 +182,17 @@ def _room_inside(roads: RoadArrays, link: int, phase: NDArray[np.int32], scratch
 
 
 @inlined_kernel
+def _is_road(roads: RoadArrays, lane: int) -> bool:
+    """Return whether vehicles may stop on a lane: outside of junctions, or where no paths meet."""
+    here = roads.lanes[lane]
+    if not here["internal"]:
+        return True
+    path = roads.links[here["link"]]
+    is_alone: bool = path["num_conflicts"] == 0 and path["num_sweeps"] == 0
+    return is_alone
+
+
+@inlined_kernel
 def _goes_first_in_swap(
     roads: RoadArrays,
     travel: TripTables,
@@ -223,8 +234,8 @@ def exit_blocked(
 
     Vehicles that move in between need room as well. The room ends at the next line at which a
     vehicle on that road, or the row itself, has to wait. The inside of a junction does not count as
-    room, except up to a free waiting position. Vehicles more than `EXIT_LOOK_M` beyond the junction
-    do not count.
+    room, except up to a free waiting position, and on a path that meets no other path. Vehicles
+    more than `EXIT_LOOK_M` beyond the junction do not count.
     """
     target = roads.links[link]
     if target["may_block"]:
@@ -255,7 +266,7 @@ def exit_blocked(
             waits |= rows[other["row"]]["hold"] != HOLD_NONE
             room -= 2.0 * other["half"] + ROOM_M
         beyond += roads.lanes[lane]["length_m"]
-        if not roads.lanes[lane]["internal"]:
+        if _is_road(roads, lane):
             road_m += roads.lanes[lane]["length_m"]
             room += roads.lanes[lane]["length_m"]
         if room >= needed or beyond > EXIT_LOOK_M:
