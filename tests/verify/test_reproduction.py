@@ -35,6 +35,8 @@ if name == "broken":
     open(words[words.index("--json") + 1], "w").write('{"rate": 12')
 elif name != "silent":
     json.dump(document, open(words[words.index("--json") + 1], "w"))
+if name == "misses":
+    sys.exit(1)
 """
 PAGE = """It makes 1,235 steps in 0.3 s, or 1,000 to 1,200 on others; sometimes 4 %.
 
@@ -151,6 +153,11 @@ def test_a_failed_command_is_reported_with_the_reason(checkout: Path) -> None:
     assert "has no speed at its top" in found[1].reason
     assert "has written no result" in found[2].reason
     assert "has written a result that is not JSON" in found[3].reason
+
+
+def test_numbers_of_a_command_are_compared_even_if_its_own_check_fails(checkout: Path) -> None:
+    (found,) = results(checkout, text("makes {} steps", values=("rate",), name="misses"))
+    assert found.verdict == "same"
 
 
 def test_names_of_files_in_a_command_are_replaced_by_paths(checkout: Path) -> None:
