@@ -64,7 +64,7 @@ class Args:
     delay_weight: Annotated[float, "weight of the reward's term delay"] = 0.1
     wait_weight: Annotated[float, "weight of the reward's term wait"] = 0.1
     decide_s: Annotated[float, "seconds between two decisions of a signal"] = 5.0
-    range_m: Annotated[float, "signals observe lanes up to at least this distance, in m"] = 50.0
+    range_m: Annotated[float, "signals observe lanes with a part within this range, in m"] = 50.0
     hidden: Annotated[int, "width of the hidden layers"] = 64
     compare: Annotated[bool, "run the scripted controllers, too"] = True
     evaluations: Annotated[int, "worlds of the evaluation"] = 5

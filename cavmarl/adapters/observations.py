@@ -1,4 +1,7 @@
-"""Parts shared by the views: the form of observations, fixed keys, and specs with a horizon."""
+"""Parts shared by the adapters (views of worlds for other libraries).
+
+The form of observations, keys that a view sets itself, and specs with a horizon.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +32,8 @@ def refuse_decided(keys: Iterable[str], *given: Mapping[str, Any] | None) -> Non
 class WithSpec:
     """Base of a view whose Gymnasium spec has the horizon of the environment.
 
-    The registered ids have no horizon, because Gymnasium would truncate longer episodes at it.
+    The registered ids have no horizon: with one, Gymnasium would truncate episodes that `overrides`
+    make longer.
     """
 
     _spec: EnvSpec | None = None

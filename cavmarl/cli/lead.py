@@ -99,7 +99,7 @@ def lead(
     ] = "go-on",
     own_ticks: Annotated[
         Literal["refuse", "ignore"],
-        about("Whether a follower that ticks the world itself is refused or ignored."),
+        about("After a follower ticks the world itself: raise an error in it, or ignore the tick."),
     ] = "refuse",
     bad_controls: Annotated[
         Literal["error", "hold"],
@@ -118,8 +118,9 @@ def lead(
     deadline_s: Annotated[
         float | None,
         about(
-            "With --pace: count steps that end more than S seconds after they are due, separately "
-            "for each phase in which the deadline passes [default: real time of one step].",
+            "With --pace: a step misses its deadline if it ends more than S seconds after it is "
+            "due. Misses are counted by the phase in which the deadline passes [default: real time "
+            "of one step].",
             "--deadline",
             metavar="S",
         ),
@@ -259,7 +260,7 @@ def _table(found: dict[str, Any]) -> Table:
         )
         for row in found["barrier"]
     )
-    heads = ("follower", "answers", "late", "invalid", "waited for, s", "slowest in")
+    heads = ("follower", "answers", "late", "invalid", "waited for, s", "slowest in, steps")
     return grid(heads, rows, f"{found['steps']} steps, {found['time_s']:g} s")
 
 

@@ -114,7 +114,10 @@ class ExternalAgents:
             )
 
     def prepare(self) -> None:
-        """Before the first step of a copied environment, store the poses; later, do nothing."""
+        """Store the poses before the first step of a copied environment.
+
+        Otherwise, do nothing: `reset` and `sense` have stored the poses before the next step.
+        """
         if self._sensing is None:
             self._sense_with(self._session.present()).rig.begin(self._scenes())
 

@@ -1,4 +1,4 @@
-"""The acknowledgements of targets at the coordinator, which are not in its log."""
+"""Acknowledgements by target zones, which the coordinator keeps outside of its log."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ class Replicas:
         return True
 
     def refuse(self, offer: Offer, tick: int, reason: Refusal) -> Refusal:
-        """Set the fence to a state, without storing the state. Return `reason`."""
+        """Raise the fence to the offered epoch and tick; store no state. Return `reason`."""
         self._raise_fence(offer.vehicle, offer.epoch, tick)
         return reason
 

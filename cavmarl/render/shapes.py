@@ -90,7 +90,8 @@ DASH_PERIOD_M = 9.0
 # A road that is higher than another one by this much is drawn over it.
 LEVEL_M = 4.0
 STOP_LINE_M = 0.7
-# A hull larger than this multiple of the area of its paths contains land, and is not filled.
+# A hull is not filled if its area is above this multiple of the area of its paths, because it then
+# also covers ground beside the roads.
 MAX_HULL_SHARE = 1.2
 MIN_HULL_M2 = 150.0  # added to that limit, so that smaller hulls are always filled
 # SUMO's link directions from left to right: left, half left, straight, half right, right. A U-turn
@@ -164,7 +165,7 @@ def road_shapes(network: RoadNetwork) -> RoadShapes:
 
 
 def level_of(z: Points) -> NDArray[np.int64]:
-    """Return the levels of heights in m; where two roads cross, the higher level is the bridge."""
+    """Return the level of each height in m; of two crossing roads, the one above is the bridge."""
     return np.asarray(np.round(z / LEVEL_M).astype(np.int64))
 
 

@@ -62,7 +62,7 @@ from cavmarl.v2x.v2x_messages import (
 
 Zeros = Callable[..., NDArray[Any]]
 Watch = Callable[[int, int, NDArray[np.void], NDArray[np.void]], None]
-"""A function of a world, a tick, and views of the PACKET (n,) and REPORT (m,) sent in the tick."""
+"""A function of a world, a tick, and views of the tick's packets (PACKET) and reports (REPORT)."""
 
 CELL_M = 100.0  # cell size of the grid of a tick's packets
 CLOSURE_RANGE_M = 500.0  # a roadside unit reports closed roads that begin within this distance

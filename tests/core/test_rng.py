@@ -1,3 +1,5 @@
+"""Random numbers, compared with their twins: plain implementations in `tests/naive`."""
+
 from __future__ import annotations
 
 import numpy as np

@@ -142,7 +142,7 @@ def test_a_service_that_loses_its_connection_to_the_store_stops_writing(
     fleet.log.flush()
     others = "SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE pid <> pg_backend_pid()"
     change(empty_postgresql, f"{others} AND datname = current_database()")
-    for _ in range(2):  # twice, because a new connection would not have the lock
+    for _ in range(2):  # the second check must not open a new connection, which has no lock
         with pytest.raises(ServiceError, match="does not answer"):
             fleet.log.store.check_lock()
     fleet.register("a")

@@ -45,7 +45,7 @@ def crossing(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return netconvert(folder, "m")
 
 
-def test_the_lanes_within_the_range_are_those_before_the_last_lane(crossing: Path) -> None:
+def test_the_range_adds_lanes_that_lead_to_the_last_lane(crossing: Path) -> None:
     network = load_network(crossing)
 
     def names(lane: str, range_m: float) -> list[str]:
@@ -56,7 +56,7 @@ def test_the_lanes_within_the_range_are_those_before_the_last_lane(crossing: Pat
     assert names("ms_0", 0.0) == []
     assert names("ms_0", 50.0) == ["am_0"]
     assert names("ms_0", 200.0) == ["am_0", "wa_0"]
-    assert names("se_0", 1000.0) == []  # the road ends at a signal
+    assert names("se_0", 1000.0) == []  # a signal is before this lane
 
 
 def test_rewards_with_a_range_do_not_depend_on_zones(crossing: Path) -> None:
@@ -82,7 +82,7 @@ def test_rewards_with_a_range_do_not_depend_on_zones(crossing: Path) -> None:
             steps = round(60.0 / vec.config.clock.ctrl_dt_s)
             for green in np.repeat(
                 [0, 1], steps
-            ):  # the road from the west has red in one of the greens
+            ):  # in one of the two greens, the road from the west has red
                 _, rewards, *_ = vec.step({"signals": np.array([[green]])})
                 found.append((rewards["signals"].tolist(), vec.state_hash()))
         assert min(rewards[0][0] for rewards, _ in found) < -2.0

@@ -82,8 +82,9 @@ def same_looks(found: NDArray[np.void], twin: Looks) -> None:
 def test_the_kernel_equals_its_twin(
     name: str, part: tuple[float, float, float, float], half_m: float, steered: bool
 ) -> None:
-    # A map from `load_steered` also has the areas that steered cars sweep. They come from a cache,
-    # because computing these areas takes minutes without the compiler.
+    # A map from `load_steered` also has the areas that steered cars sweep: cars of agents, whose
+    # bumpers are not always on their path. These areas come from a cache, because computing them
+    # takes minutes without the compiler.
     roads = load_steered(find_map(name)) if steered else network(name)
     min_x, min_y, max_x, max_y = roads.extent_m
     low, high = np.array([min_x, min_y] * 2), np.array([max_x, max_y] * 2)

@@ -60,9 +60,9 @@ _MAX_PORT = 65534  # the streams have the next port
 class ClientConnection(asyncio.Protocol):
     """The RPC connection of one client.
 
-    A tick waits a moment for listeners that may be on their way to new sensors: a client that calls
-    `listen` and then `tick` expects the frame of this tick, but connects to the stream port without
-    waiting.
+    A tick waits a moment for clients that are about to listen to new sensors. A client that calls
+    `listen` and then `tick` expects the frame of this tick, but its `listen` does not wait until
+    the client is connected to the stream port.
     """
 
     def __init__(self, session: CarlaSession, connections: set[ClientConnection]) -> None:
@@ -285,9 +285,10 @@ def serve(
         any_host: must be set for an address that other machines can reach.
         client: version of the clients: `0.9.15`, `0.9.16` or `0.10.0`.
         limits: limits of what clients may demand.
-        other_ticks: what happens if a client other than the first ticks; see `CarlaSession`.
+        other_ticks: what happens if two clients call `tick`; see `CarlaSession`.
         recordings: folder of the recordings that clients make; None: they can make none.
-        map_file: the map of `env`, if it is an environment that is not in the library.
+        map_file: the map of `env`, if `env` is a `CavEnv` whose name is in neither `./envs` nor the
+            package.
         told: called with the server when it listens.
 
     Raises:

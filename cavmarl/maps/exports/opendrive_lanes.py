@@ -1,4 +1,4 @@
-"""Splits roads over junctions if their lanes are not neighbours on the roads that they join.
+"""Splits roads over junctions if their lanes are not neighbours on the road before or after.
 
 netconvert writes all lanes that lead from one road to another as one road, side by side. If a lane
 between them leads elsewhere, or two lanes end in one lane, the drawn lanes have gaps or overlap.

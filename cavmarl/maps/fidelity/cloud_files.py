@@ -167,7 +167,7 @@ def _read_ply(path: Path, stream: BinaryIO) -> Points:
     if number == 0:
         return np.zeros((0, 3))
     if len(set(names)) < len(names):
-        raise MapError(f"{path}: two properties of its vertices have one name: export it again")
+        raise MapError(f"{path}: two vertex properties have the same name: export it again")
     if not {"x", "y", "z"} <= set(names):
         raise MapError(f"{path}: its vertices have no x, y and z: export it again")
     if order == "=":

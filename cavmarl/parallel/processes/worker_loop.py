@@ -34,10 +34,12 @@ from cavmarl.parallel.processes import process_barrier as barrier
 from cavmarl.parallel.processes.process_barrier import NUMBER, WAKE, WORDS, WakeSignal, present_core
 from cavmarl.parallel.state.state_image import Arrays, Image
 
-# Words of the pool's line, after the words of `process_barrier`: task, whether it has a payload,
-# image to write (-1: none), committed image (-1: none), whether to resume from that image.
+# Words of the cache line that the pool writes, after the words of `process_barrier`: task, whether
+# it has a payload, image to write (-1: none), committed image (-1: none), whether to resume from
+# that image.
 TASK, PAYLOAD, SLOT, COMMITTED, LOADS = 2, 3, 4, 5, 6
-# Words of the line of a worker: how its command ended, and the core on which it began.
+# Words of the cache line that a worker writes: how its command ended, and the core on which it
+# began.
 ANSWER, CORE = 2, 3
 SILENT, ANSWERED, FAILED = 0, 1, 2
 
@@ -49,7 +51,10 @@ MAX_TRACEBACK = 16_000  # characters of at most six bytes; a longer traceback lo
 
 
 class TeamFailedError(Exception):
-    """A worker cannot go on because another worker of its team failed, which reports the reason."""
+    """A worker cannot go on because another worker of its team failed, which reports the reason.
+
+    A team is a worker, or several workers that share the zones of one world.
+    """
 
 
 class Job:

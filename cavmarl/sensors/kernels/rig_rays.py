@@ -1,7 +1,7 @@
 """Lidars and radars on agents' vehicles.
 
-A radar target is a body or a building that is the first hit of a ray of the fan; the target's echo
-is the nearest of these hits. The radial speed is the speed of the target's centre relative to the
+A radar target is a body or a building that at least one ray of the fan hits first. The nearest hit
+of a target is its echo. The radial speed is the speed of the target's centre relative to the
 sensor, along the ray, positive if the distance grows. The ground and clutter give no echo.
 """
 

@@ -21,7 +21,7 @@ _ROUNDING_M = 1e-6
 
 
 def zone_halo(partition: ZonePartition, halo_m: float) -> Halo:
-    """Return a halo for `ghost_exchange.exchange` in which zones see all vehicles."""
+    """Return a halo for `ghost_exchange.exchange`; zones see all vehicles within `halo_m`."""
     if not (math.isfinite(halo_m) and halo_m >= 0.0):
         raise ConfigError(f"halo_m = {halo_m!r}: must be a finite number of at least 0")
     near = partition.within(halo_m)

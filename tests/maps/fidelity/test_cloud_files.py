@@ -97,7 +97,7 @@ def test_invalid_points_are_dropped_and_counted(tmp_path: Path) -> None:
         ("a.ply", "x,y,z\n1,2,3\n", "does not match '.ply'"),
         ("a.ply", "ply\nformat ascii 1.0\nend_header\n", "no number of vertices"),
         ("a.ply", f"{PLY} {'9' * 5000}\n{XYZ}", "no number of vertices"),
-        ("a.ply", f"{PLY} 1\nproperty float x\n{XYZ}", "have one name"),
+        ("a.ply", f"{PLY} 1\nproperty float x\n{XYZ}", "have the same name"),
         ("a.ply", f"{PLY} 0\n{XYZ}", "has no points"),
         ("a.ply", f"{PLY} 3\n{XYZ}\n\n\n", "0 of 3 points"),
         ("a.las", "LASF", "not a complete las"),

@@ -65,7 +65,7 @@ class SumoEnvironment(gymnasium.Env[Any, Any], EzPickle):
         enforce_max_green: whether the next green begins if an action would exceed `max_green`.
         single_agent: whether only the first signal has an agent; other signals keep their greens.
         reward_fn: a name in `TrafficSignal.reward_fns`, a function of a TrafficSignal, a list of
-            these, or a mapping from the id of each signal.
+            these, or a mapping from the id of each signal to one of these.
         reward_weights: weights of a list of rewards; None: rewards are arrays.
         observation_class: subclass of ObservationFunction.
         add_system_info: whether infos have the values of all vehicles.
@@ -309,7 +309,7 @@ class SumoEnvironment(gymnasium.Env[Any, Any], EzPickle):
         for ts, action in actions.items():
             if ts not in self.traffic_signals:
                 raise ActionError(
-                    f"no signal {ts!r} with two greens; there are {', '.join(self.ts_ids[:8])}"
+                    f"no signal {ts!r} with two greens; choose from {', '.join(self.ts_ids[:8])}"
                 )
             choices[world.table.ids.index(ts)] = self.traffic_signals[ts].choice(action)
         world.step(choices)
@@ -378,7 +378,10 @@ class SumoEnvironment(gymnasium.Env[Any, Any], EzPickle):
             writer.writerows(self.metrics)
 
     def encode(self, state: NDArray[np.float32], ts_id: str) -> tuple[Any, ...]:
-        """Return a default observation as a key of tables: green, flag, tenths of densities."""
+        """Return a default observation as a key of a Q-table.
+
+        The key has the green, whether the green may end, and tenths of the densities.
+        """
         greens = self.traffic_signals[ts_id].num_green_phases
         densities = [min(int(value * 10), 9) for value in state[greens + 1 :]]
         return (int(np.argmax(state[:greens])), state[greens], *densities)

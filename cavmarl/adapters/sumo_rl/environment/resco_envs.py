@@ -53,8 +53,8 @@ def _folder(name: str, nets: str | Path | None) -> Path:
     root = nets or os.environ.get(NETS)
     if not root:
         raise ConfigError(
-            f"{name}: the maps of RESCO are not part of cavmarl; pass nets=FOLDER or set {NETS}, "
-            "to the folder sumo_rl/nets of sumo-rl or to RESCO's own maps"
+            f"{name}: the maps of RESCO are not part of cavmarl; pass nets=FOLDER or set {NETS}. "
+            "The folder is sumo_rl/nets of sumo-rl, or that of RESCO's own maps"
         )
     for folder in (Path(root) / name, Path(root) / "RESCO" / name):
         if (folder / f"{name}.net.xml").is_file():
