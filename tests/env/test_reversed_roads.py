@@ -245,7 +245,7 @@ def test_invalid_reversals_are_refused_with_a_remedy() -> None:
         with pytest.raises(CapacityError, match=r"map\.changed_lanes = 5; set it higher"):
             env.close_road("C1B1", contraflow=True)
         assert env.closed_roads() == ("B1B2",)
-    with pytest.raises(ConfigError, match=r"map\.changed_lanes = 0: map\.contraflow needs lanes"):
+    with pytest.raises(ConfigError, match=r"map\.changed_lanes = 0: map\.contraflow changes lanes"):
         parallel_env("grid4x4", overrides={"map.contraflow": ["B1B2"]})
     with pytest.raises(ConfigError, match=r"map\.contraflow: the map has no road 'Z9'"):
         parallel_env("grid4x4", overrides={**ROOM, "map.contraflow": ["Z9"]})

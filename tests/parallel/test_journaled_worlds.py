@@ -113,7 +113,7 @@ def test_balancing_together_with_repartitioning_is_refused_with_a_journal(make: 
         "workers.balance_steps": 5,
         "zones.repartition_steps": 4,
     }
-    with pytest.raises(ConfigError, match=r"leave workers\.balance_steps or zones\.repart"):
+    with pytest.raises(ConfigError, match=r"set workers\.balance_steps or zones\.repart"):
         make("grid4x4", num_envs=3, zones=2, workers=2, overrides=overrides)
     assert not Path("x.jsonl").exists()
 

@@ -428,7 +428,7 @@ def another_episode(messages: list[tuple[int, Message]], worlds: list[Any]) -> b
         (report_as_new, "at most once in an episode"),
         (other_mover, "which it does not own"),
         (other_digest, "it has offered another state of vehicle"),
-        (another_episode, "an episode has begun: True"),
+        (another_episode, "it wrongly reports a new episode"),
     ],
 )
 def test_the_sender_of_a_wrong_report_is_lost(
