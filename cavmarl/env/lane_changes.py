@@ -190,6 +190,11 @@ class LaneChanges:
         self._reversed.begin(world, edge, RETURNING)
         self._tell(world, limit_mps, classes, (CLOSED, contraflow_of(edge)))
 
+    @property
+    def can_advance(self) -> bool:
+        """Whether there are events, or roads that can be reversed."""
+        return bool(self._events) or self._reversed.states.size > 0
+
     def advance(self, ticks: NDArray[np.int64]) -> None:
         """Apply the events of the next step, and continue to reverse or restore roads.
 

@@ -130,7 +130,8 @@ class StepSession:
         waiting = (
             self.events, self.insertions, self.external, self.overrides, self.lane_changes
         )  # fmt: skip
-        self.lane_changes.advance(self._ticks_of_running())
+        if self.lane_changes.can_advance:
+            self.lane_changes.advance(self._ticks_of_running())
         for part in waiting:
             commands = part.add_to(commands)
         self.worlds.step(commands)

@@ -193,6 +193,15 @@ def test_a_road_that_is_closed_during_its_return_stays_closed(tmp_path: Path) ->
         assert drive(1) == ()
 
 
+def test_steps_without_events_and_reversible_roads_examine_no_roads(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(LaneChanges, "advance", lambda *_: pytest.fail("roads are examined"))
+    with closing(make_vec("merge", num_envs=1, overrides={"map.changed_lanes": 2})) as vec:
+        vec.reset(seed=1)
+        vec.step(vec.suggest_actions())
+
+
 def test_saved_states_with_invalid_reversals_are_refused(tmp_path: Path) -> None:
     with closing(make_vec(chain(tmp_path), num_envs=1)) as vec:
         vec.reset(seed=1)
