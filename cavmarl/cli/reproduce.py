@@ -158,7 +158,7 @@ def _table(results: Sequence[LineResult]) -> Table:
             verdict = "same" if one.is_same else "[red]differs[/]"
             place = f"{result.name}: {one.place}" if len(result.comparisons) > 1 else result.name
             rows.append((escape(place), one.published, measured, one.tolerance, verdict))
-        if not shown or result.verdict == "failed":
+        if not shown or result.reason:
             count = f"{len(result.comparisons)} numbers" if result.comparisons else ""
             verdict = escape(": ".join(filter(None, (result.verdict, result.reason))))
             rows.append((result.name, count, "", "", verdict))

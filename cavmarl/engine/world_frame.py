@@ -115,7 +115,7 @@ def frame_of(
     order = np.argsort(rows["id"], kind="stable")  # fast for ids that are almost sorted
     write_seen(rows, order, simulation.types, seen)
     view = simulation.zones.view(world) if simulation.partition.count > 1 else None
-    if view is not None:
+    if view is not None and view.transfers:
         _mark_transfers(seen, view.transfers)
     tick = int(simulation.ticks()[world])
     return WorldFrame(

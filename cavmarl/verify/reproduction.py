@@ -58,7 +58,7 @@ class LineResult:
         verdict: `same`: all numbers agree; `differs`; `failed`: the command has failed, or its
             result lacks a number; `skipped` and `by hand`: the command did not run.
         comparisons: the compared numbers.
-        reason: why the command was not run or has failed.
+        reason: why the command was not run or has failed, or that a check of its own has failed.
     """
 
     name: str
@@ -77,6 +77,10 @@ class CommandRunner:
     Args:
         root: root folder of the checkout.
         files: word of a command → path that replaces the word.
+
+    Attributes:
+        unmet: commands that have written their result, and ended with 1: a check of their own has
+            failed.
     """
 
     def __init__(self, root: Path, files: Mapping[str, Path]) -> None:
@@ -86,6 +90,7 @@ class CommandRunner:
         self._root = root
         self._files = {word: path.resolve() for word, path in files.items()}
         self._found: dict[str, Any] = {}
+        self.unmet: set[str] = set()
 
     def lacking(self, needs: Iterable[str]) -> str:
         """Return the first requirement of a line that this machine lacks; empty: it has all."""
@@ -141,8 +146,9 @@ class CommandRunner:
                 raise EvaluationError(f"did not end within {most_s:.0f} s: {command}") from None
             finally:
                 _end_group(program)
-            # A command also ends with 1 if a check of its own fails; its numbers are compared.
-            if code and not (code == 1 and result.is_file()):
+            if code == 1 and result.is_file():
+                self.unmet.add(command)
+            elif code:
                 raise EvaluationError(
                     f"ended with exit code {code}: {_last_line(last_words(output))}"
                 )
@@ -209,7 +215,9 @@ def _repeated(
     if not found:
         return LineResult(name, "failed", reason="the line compares nothing; add an expression")
     is_same = all(comparison.is_same for comparison in found)
-    return LineResult(name, "same" if is_same else "differs", tuple(found))
+    unmet = any(cell.command in runner.unmet for cell in cells)
+    reason = "a check of the command itself has failed" if unmet else ""
+    return LineResult(name, "same" if is_same else "differs", tuple(found), reason)
 
 
 def _compared(cell: PublishedCell, line: PublishedLine, document: Any) -> Iterator[ComparedNumber]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from cavmarl import parallel_env
 from cavmarl.core.errors import MapError
 from cavmarl.core.records.codes import (
     HOLD_NONE,
@@ -207,6 +209,29 @@ def test_a_path_over_a_junction_that_no_path_meets_counts_as_room(
             network.arrays, travel, table, table[0], int(link), int(table[0]["way"]), phase, room
         )
     assert is_blocked_at[SIGNAL_RED] == is_crossed
+
+
+def test_divided_worlds_equal_the_undivided_world_where_vehicles_wait_on_such_a_path(
+    tmp_path: Path,
+) -> None:
+    net = signals_with_a_junction_between(tmp_path, is_crossed=False)
+    text = re.sub(r'(<tlLogic id="j2"[^>]* offset=)"0"', r'\1"45"', net.read_text())
+    net.write_text(text)  # the second signal is red while the first is green
+    hashes: dict[int, list[str]] = {}
+    for zones in (1, 2, 4):
+        world = parallel_env(net, zones=zones, agents=2, background=16)
+        with closing(world):
+            world.reset(seed=1)
+            lanes, num_waiting, hashes[zones] = world.network.lanes, 0, []
+            between = world.network.links["from_lane"] == world.network.lane_ids.index("jm_0")
+            for _ in range(300):
+                world.step(world.suggest_actions())
+                hashes[zones].append(world.state_hash())
+                rows = world.worlds.simulation.vehicles()
+                inside = lanes["internal"][rows["lane"]] & between[lanes["link"][rows["lane"]]]
+                num_waiting += int((inside & (rows["wait_s"] > 1.0)).sum())
+        assert num_waiting
+    assert hashes[1] == hashes[2] == hashes[4]
 
 
 def test_a_connection_can_allow_vehicles_to_block_the_junction(tmp_path: Path) -> None:
